@@ -1,0 +1,5 @@
+"""The command `mavfdi`."""
+
+
+def main() -> int:
+    return 0

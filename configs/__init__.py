@@ -1,0 +1,1 @@
+"""One TOML file per airframe, read through `importlib.resources`."""

@@ -1,0 +1,1 @@
+"""The mathematics: residuals, observers, filters, statistical tests, isolation.  Arrays in, arrays out."""

@@ -1,0 +1,1 @@
+"""Vehicles to test against: plants, sensors, faults, guidance, and an autopilot that speaks MAVLink."""
