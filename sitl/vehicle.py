@@ -71,7 +71,7 @@ class Vehicle:
 
     name: str
     mav_type: int
-    modes: Mapping[str, int]  # name -> custom_mode; the first is the one it flies in
+    modes: Mapping[str, int]  # name -> custom_mode; the first is the one it flies in.  A change goes to `command` as "MODE"
     streams: tuple[Stream, ...]
     parameters: tuple[Parameter, ...]
     injections: tuple[Injection, ...]
