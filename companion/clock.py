@@ -1,0 +1,59 @@
+"""Arrival stamps: microseconds since 1970 that never run backwards, at the pace of the vehicle.
+
+The wall clock is read once, at the start; a step of NTP afterwards moves no stamp.  Stamps are multiples of 4 us because
+a tlog keeps the link's number in the two lowest bits: what is decided live is decided from the very stamp on disk.
+"""
+
+import time
+from typing import Final, Protocol
+
+STAMP_US: Final = 4
+
+
+class Clock(Protocol):
+    """Where arrival stamps come from."""
+
+    def now_us(self) -> int:
+        """The present, a multiple of 4."""
+
+    def advance_to(self, vehicle_us: int) -> None:
+        """In lockstep: the vehicle has reached this time since its boot."""
+
+    def wait_s(self, pause_s: float) -> float:
+        """How long to wait for bytes if nothing is to be done for pause_s of the vehicle's time."""
+
+
+class WallClock:
+    """Real time, or a multiple of it beside a simulator that flies faster."""
+
+    def __init__(self, speedup: float = 1.0) -> None:
+        self._speedup = speedup
+        self._epoch_us = time.time_ns() // 1000
+        self._start_ns = time.monotonic_ns()
+
+    def now_us(self) -> int:
+        passed_us = int((time.monotonic_ns() - self._start_ns) * self._speedup) // 1000
+        return (self._epoch_us + passed_us) // STAMP_US * STAMP_US
+
+    def advance_to(self, vehicle_us: int) -> None:
+        """Real time does not wait for the vehicle."""
+
+    def wait_s(self, pause_s: float) -> float:
+        return pause_s / self._speedup
+
+
+class VehicleClock:
+    """Lockstep: time passes when the simulator says so, which makes a run over real sockets reproducible to the bit."""
+
+    def __init__(self, epoch_us: int | None = None) -> None:
+        self._epoch_us = time.time_ns() // 1000 if epoch_us is None else epoch_us
+        self._vehicle_us = 0
+
+    def now_us(self) -> int:
+        return (self._epoch_us + self._vehicle_us) // STAMP_US * STAMP_US
+
+    def advance_to(self, vehicle_us: int) -> None:
+        self._vehicle_us = max(self._vehicle_us, vehicle_us)
+
+    def wait_s(self, pause_s: float) -> float:
+        return pause_s

@@ -1,0 +1,120 @@
+"""MAVLink's message definitions, taken from pymavlink, in the form that reading and writing frames needs.
+
+Nothing else of pymavlink is used by the companion: no `mavutil`, no parameter client, no signing.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Final
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as messages
+
+Value = int | float | str | tuple[int, ...] | tuple[float, ...]
+Fields = Mapping[str, Value]
+
+MAGIC_V1: Final = 0xFE
+MAGIC_V2: Final = 0xFD
+SIGNED: Final = 0x01  # the only incompatibility flag there is; a frame with another one cannot be read
+SIGNATURE_BYTES: Final = 13
+CRC_BYTES: Final = 2
+HEADER_BYTES: Final = MappingProxyType({MAGIC_V1: 6, MAGIC_V2: 10})
+LONGEST_FRAME_BYTES: Final = 10 + 255 + CRC_BYTES + SIGNATURE_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """One message type: how its payload is laid out and how its CRC is seeded."""
+
+    id: int
+    name: str
+    crc_extra: int
+    layout: struct.Struct
+    fields: tuple[str, ...]  # in the order of the wire
+    types: tuple[str, ...]  # "uint32_t", "char", ..., in the same order
+    counts: tuple[int, ...]  # 0: a scalar, else an array of so many (a char array is one text)
+    starts: tuple[int, ...]  # where the field begins in the unpacked tuple
+    units: Mapping[str, str]  # wire units as MAVLink writes them: "cm/s", "degE7"
+
+    def unpack(self, payload: bytes) -> tuple[int | float | bytes, ...]:
+        """Payload -> flat tuple.  MAVLink 2 cuts trailing zeros, newer definitions append fields: both are read."""
+        size = self.layout.size
+        if len(payload) < size:
+            payload = payload + bytes(size - len(payload))
+        elif len(payload) > size:
+            payload = payload[:size]
+        return self.layout.unpack(payload)
+
+
+@cache
+def definition(message_id: int) -> Definition | None:
+    """The definition of a message id, None if pymavlink's `all` dialect does not know it."""
+    message = messages.mavlink_map.get(message_id)
+    if message is None:
+        return None
+    types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+    starts, position = [], 0
+    counts = []
+    for name, count in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
+        text = types[name] == "char"
+        starts.append(position)
+        counts.append(count)
+        position += 1 if text or count == 0 else count
+    return Definition(
+        message.id,
+        message.msgname,
+        message.crc_extra,
+        message.unpacker,
+        tuple(message.ordered_fieldnames),
+        tuple(types[name] for name in message.ordered_fieldnames),
+        tuple(counts),
+        tuple(starts),
+        dict(message.fieldunits_by_name),
+    )
+
+
+@cache
+def by_name(name: str) -> Definition:
+    """The definition of a message name.  Raises KeyError for a name that the dialect does not have."""
+    for message_id, message in messages.mavlink_map.items():
+        if message.msgname == name:
+            found = definition(message_id)
+            assert found is not None  # it came from the same map
+            return found
+    raise KeyError(name)
+
+
+def encode(name: str, fields: Fields, *, sysid: int, compid: int, seq: int) -> bytes:
+    """One MAVLink 2 frame, unsigned.  Fields left out are zero.  Raises KeyError for an unknown message or field."""
+    message = by_name(name)
+    if unknown := set(fields) - set(message.fields):
+        raise KeyError(f"{name} has no field {', '.join(sorted(unknown))}")
+    values: list[int | float | bytes] = []
+    for field, kind, count in zip(message.fields, message.types, message.counts, strict=True):
+        value = fields.get(field, "" if kind == "char" else (0,) * count if count else 0)
+        if isinstance(value, str):
+            values.append(value.encode())
+        elif isinstance(value, tuple):
+            values.extend(value + (0,) * (count - len(value)))
+        else:
+            values.append(value)
+    payload = message.layout.pack(*values).rstrip(b"\0") or b"\0"  # never empty: the protocol keeps the first byte
+    head = struct.pack("<BBBBBBHB", len(payload), 0, 0, seq & 0xFF, sysid, compid, message.id & 0xFFFF, message.id >> 16)
+    crc = mcrf4xx(head + payload + bytes((message.crc_extra,)))
+    return bytes((MAGIC_V2,)) + head + payload + struct.pack("<H", crc)
+
+
+def decode_fields(message: Definition, payload: bytes) -> dict[str, Value]:
+    """All fields by name; char arrays as text up to their first NUL, other arrays as tuples."""
+    flat = message.unpack(payload)
+    out: dict[str, Value] = {}
+    for name, count, start in zip(message.fields, message.counts, message.starts, strict=True):
+        value = flat[start]
+        if isinstance(value, bytes):
+            out[name] = value.partition(b"\0")[0].decode("utf-8", "replace")
+        else:
+            out[name] = value if count == 0 else flat[start : start + count]  # type: ignore[assignment]  # numbers all
+    return out
