@@ -46,9 +46,17 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
+class VehicleTable:
+    """`[vehicle]`: by what a vehicle of this airframe is known on the link."""
+
+    mav_types: tuple[int, ...]  # MAV_TYPE of its HEARTBEAT; empty: only by name
+
+
+@dataclass(frozen=True, slots=True)
 class Configuration:
     """Everything that the companion reads; the airframe's own tables are still unread TOML."""
 
+    vehicle: VehicleTable
     grid: Grid
     streams: dict[str, float]  # message -> Hz
     decision: Rules

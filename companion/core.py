@@ -100,6 +100,7 @@ class Core:
     _rivals_told: bool = False
     _missing_told: tuple[str, ...] = ()
     _repeat_us: int = 0
+    _row_t_us: int | None = None  # vehicle time of the row in hand: what follows from a row happened then
 
     def __post_init__(self) -> None:
         config = self.airframe.configuration
@@ -128,7 +129,8 @@ class Core:
         if frame.sysid == self.sysid and frame.compid == self.compid:
             return out
         if not self.watch.is_autopilot(frame):
-            self.counts["foreign"] += frame.sysid != self.sysid
+            if frame.sysid != self.sysid:
+                self.counts["foreign"] += 1
             self._request(frame, out)
             return out
         self.counts["messages"] += 1
@@ -164,8 +166,8 @@ class Core:
             silent_s = (when_us - self.watch.heard_us) * 1e-6
             text = f"no word from the vehicle for {silent_s:.0f} s"
             self._tell(out, Event(Kind.LINK, state.value, Severity.WARNING, text), at_us=when_us)
-        if self.watch.choose(arrival_us):
-            self._found(out)
+        if (ripe_us := self.watch.choose(arrival_us)) is not None:
+            self._found(ripe_us, out)
         if self.watch.rivals and not self._rivals_told:
             self._rivals_told = True
             text = f"systems {', '.join(map(str, self.watch.rivals))} all fly; say which one with --sysid"
@@ -184,17 +186,14 @@ class Core:
 
     # -- the vehicle ------------------------------------------------------------------------------------------------
 
-    def _found(self, out: list[Effect]) -> None:
+    def _found(self, at_us: int, out: list[Effect]) -> None:
         watch = self.watch
         text = f"system {watch.sysid} component {watch.compid} is the vehicle"
         details = {"autopilot": watch.autopilot, "type": watch.type}
-        self._tell(out, Event(Kind.VEHICLE, "seen", Severity.INFO, text, details=details))
-        self._tell(
-            out,
-            Event(Kind.LINK, "up", Severity.INFO, "the vehicle is heard"),
-            f"watching {self.airframe.name}, policy {self.policy.value}",
-        )
-        out += [self._to_vehicle(send) for send in self._streams.ask(self._now_us)]
+        self._tell(out, Event(Kind.VEHICLE, "seen", Severity.INFO, text, details=details), at_us=at_us)
+        spoken = f"watching {self.airframe.name}, policy {self.policy.value}"
+        self._tell(out, Event(Kind.LINK, "up", Severity.INFO, "the vehicle is heard"), spoken, at_us=at_us)
+        out += [self._to_vehicle(send) for send in self._streams.ask(at_us)]
         if self.record:
             self._take_up_record(out)
 
@@ -258,7 +257,7 @@ class Core:
     def _lacking(self, out: list[Effect]) -> None:
         for name in self._missing_told:
             event = Event(Kind.CHECK, "stream_missing", Severity.WARNING, f"{name} does not come", details={"message": name})
-            self._tell(out, event, f"no {name} stream")
+            self._tell(out, event, f"no {name} stream", at_us=self._streams.until_us)
 
     def _ask_parameters(self, arrival_us: int) -> list[Effect]:
         missing = [name for name in self.airframe.detector.parameters if name not in self.parameters]
@@ -275,6 +274,7 @@ class Core:
         if name in self.airframe.detector.parameters and math.isfinite(value) and self.parameters.get(name) != value:
             self.parameters[name] = value
             self.monitor.told(0, self.parameters)
+            self.standing = Finding(Phase.WARMING)  # what was found belongs to the vehicle as it was; judged anew
         if self.recovery is not None and self.plan is not None:
             said = Said(name, value, kind)
             self._advance(self.recovery, recoveries.hear(self.recovery, self.plan, said, self._session_us), out)
@@ -292,6 +292,7 @@ class Core:
     def _row(self, row: GridRow, out: list[Effect]) -> None:
         self.counts["rows"] += 1
         self._rows_us = self._now_us
+        self._row_t_us = row.t_us
         self._session_us += self.airframe.configuration.grid.period_us
         if row.restart is not None:
             self._restart(row, out)
@@ -304,21 +305,23 @@ class Core:
             self._advance(self.recovery, recoveries.tick(self.recovery, self.plan, self._session_us), out)
             evidence = self._evidence(self.plan, verdict, finding)
             self._advance(self.recovery, recoveries.judge(self.recovery, self.plan, evidence, self._session_us), out)
+        self._row_t_us = None
 
     def _restart(self, row: GridRow, out: list[Effect]) -> None:
         self.monitor = self.airframe.monitor()
         if self.parameters:
             self.monitor.told(0, self.parameters)
         if row.restart is Restart.REBOOT:
-            event = Event(Kind.VEHICLE, "reboot", Severity.WARNING, "the autopilot rebooted", t=row.t_us * 1e-6)
+            event = Event(Kind.VEHICLE, "reboot", Severity.WARNING, "the autopilot rebooted")
             self._tell(out, event, "autopilot rebooted, watching anew")
             self.parameters.clear()
             self._parameter_tries = self._parameters_due_us = 0
-            out += [self._to_vehicle(send) for send in self._streams.ask(self._now_us)]
+            arrived_us = row.t_us + (self.aligner.offset_us or 0)
+            out += [self._to_vehicle(send) for send in self._streams.ask(arrived_us)]
             if self.recovery is not None and self.plan is not None:
                 self._advance(self.recovery, recoveries.rebooted(self.recovery, self.plan, self._session_us), out)
         elif row.restart is Restart.JUMP:
-            event = Event(Kind.VEHICLE, "clock", Severity.NOTICE, "the vehicle's clock jumped", t=row.t_us * 1e-6)
+            event = Event(Kind.VEHICLE, "clock", Severity.NOTICE, "the vehicle's clock jumped")
             self._tell(out, event)
         if row.restart is not Restart.FIRST and self.recovery is not None and self.recovery.stage is Stage.UNCERTAIN:
             assert self.plan is not None  # there is no recovery without its plan
@@ -347,28 +350,26 @@ class Core:
                 self._repeat_us = self._session_us + round(1e6 * self.airframe.configuration.decision.repeat_s)
                 self._say(out, self._spoken(fault, finding), Severity.CRITICAL)
             return
-        t = row.t_us * 1e-6
         evidence = self._residuals(verdict)
         if finding.phase is Phase.HEALTHY:
             if alarmed:
-                event = Event(Kind.FAULT, "cleared", Severity.NOTICE, "nothing wrong any more", t=t, evidence=evidence)
+                event = Event(Kind.FAULT, "cleared", Severity.NOTICE, "nothing wrong any more", evidence=evidence)
                 self._tell(out, event, "fault cleared")
             return
         if not alarmed:
             over = ", ".join(name for name, (value, limit) in evidence.items() if value > limit) or "a test"
             text = f"something is wrong: {over} above threshold"
             severity = Severity.WARNING
-            self._tell(out, Event(Kind.FAULT, "detected", severity, text, t=t, evidence=evidence), "something is wrong")
+            self._tell(out, Event(Kind.FAULT, "detected", severity, text, evidence=evidence), "something is wrong")
         if finding.phase is Phase.ISOLATED:
             self._isolated(row, verdict, finding, before, out)
         elif finding.phase is Phase.INCONCLUSIVE:
             text = "something is wrong, cause not clear"
-            self._tell(out, Event(Kind.FAULT, "inconclusive", Severity.WARNING, text, t=t, evidence=evidence), text)
+            self._tell(out, Event(Kind.FAULT, "inconclusive", Severity.WARNING, text, evidence=evidence), text)
 
     def _isolated(self, row: GridRow, verdict: Verdict, finding: Finding, before: Finding, out: list[Effect]) -> None:
         fault = self._fault(finding.fault_id)
         assert fault is not None  # isolated means named
-        t = row.t_us * 1e-6
         size, age_s = float(verdict.size[0]), float(verdict.onset_s[0])
         facts = FaultFacts(
             fault.id,
@@ -377,12 +378,12 @@ class Core:
             finding.confidence,
             size if math.isfinite(size) else None,
             fault.size_unit,
-            t - age_s if math.isfinite(age_s) else None,
+            round(row.t_us / 1e6 - age_s, 6) if math.isfinite(age_s) else None,
         )
         self.faults.append(facts)
         name = "changed" if before.phase is Phase.ISOLATED else "isolated"
         spoken = self._spoken(fault, finding)
-        event = Event(Kind.FAULT, name, Severity.CRITICAL, spoken, t=t, fault=facts, evidence=self._residuals(verdict))
+        event = Event(Kind.FAULT, name, Severity.CRITICAL, spoken, fault=facts, evidence=self._residuals(verdict))
         self._repeat_us = self._session_us + round(1e6 * self.airframe.configuration.decision.repeat_s)
         self._tell(out, event, spoken)
 
@@ -427,8 +428,7 @@ class Core:
             assert finding.fault_id is not None
             self._confirmed = False
             self.plan = plan
-            text = f"{plan.text}: {decision.because}"
-            event = Event(Kind.RECOVERY, "considered", Severity.WARNING, text, t=row.t_us * 1e-6, reason=decision.because)
+            event = Event(Kind.RECOVERY, "considered", Severity.WARNING, plan.text, reason=decision.because)
             self._tell(out, event)
             self.recovery, effects = recoveries.begin(plan, finding.fault_id, self._session_us)
             self._carry_out(effects, out)
@@ -436,7 +436,7 @@ class Core:
             assert plan is not None
             assert finding.fault_id is not None
             self._advised = finding.fault_id
-            event = Event(Kind.RECOVERY, "advised", Severity.WARNING, f"advised: {plan.text}", t=row.t_us * 1e-6)
+            event = Event(Kind.RECOVERY, "advised", Severity.WARNING, f"advised: {plan.text}")
             self._tell(out, replace(event, reason=decision.because), f"advise: {plan.text}")
 
     def _advance(self, before: Recovery, output: recoveries.Output, out: list[Effect]) -> None:
@@ -547,8 +547,8 @@ class Core:
     def _tell(self, out: list[Effect], event: Event, spoken: str = "", *, at_us: int | None = None) -> None:
         """Stamp an event and give it out; `spoken` goes out on STATUSTEXT as well."""
         stamp_us = self._now_us if at_us is None else at_us
-        t_us = self.aligner.vehicle_time_us(stamp_us)
-        t = event.t if event.t is not None else t_us * 1e-6 if t_us is not None else None
+        t_us = self._row_t_us if self._row_t_us is not None else self.aligner.vehicle_time_us(stamp_us)
+        t = t_us / 1e6 if t_us is not None else None
         out.append(Tell(replace(event, t=t, utc_us=stamp_us), spoken))
         if spoken:
             self._say(out, spoken, event.severity)

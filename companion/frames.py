@@ -6,6 +6,7 @@ checked; it is given out marked as such (to be recorded and forwarded, never bel
 
 from collections import Counter
 from dataclasses import dataclass, field
+from enum import Enum
 
 from fastcrc.crc16 import mcrf4xx
 
@@ -53,10 +54,18 @@ class IncompleteError(Exception):
     """The candidate at this place ends behind the bytes at hand."""
 
 
-def candidate(data: bytes, start: int) -> tuple[Frame, bool] | None:
-    """Look for a frame at `start`: (frame, checked good) or None where none can begin or the CRC is wrong.
+class Check(Enum):
+    """What the CRC says of a candidate."""
 
-    An unknown id comes back as (frame, False).  Raises IncompleteError if the bytes at hand end before the frame does.
+    GOOD = "good"
+    BAD = "bad"
+    UNKNOWN = "unknown"  # an id whose seed we do not know: it cannot be checked
+
+
+def candidate(data: bytes, start: int) -> tuple[Frame, Check] | None:
+    """Look for a frame at `start`; None where none can begin.
+
+    Raises IncompleteError if the bytes at hand end before the frame does.
     """
     magic = data[start]
     if magic not in HEADER_BYTES:
@@ -81,12 +90,12 @@ def candidate(data: bytes, start: int) -> tuple[Frame, bool] | None:
     body = start + header
     message = definition(message_id)
     payload = data[body : body + length]
+    check = Check.UNKNOWN
     if message is not None:
         crc = data[body + length] | data[body + length + 1] << 8
-        if mcrf4xx(data[start + 1 : body + length] + bytes((message.crc_extra,))) != crc:
-            return None
-    frame = Frame(data[start:end], message_id, sysid, compid, seq, message, payload)
-    return frame, message is not None
+        fits = mcrf4xx(data[start + 1 : body + length] + bytes((message.crc_extra,))) == crc
+        check = Check.GOOD if fits else Check.BAD
+    return Frame(data[start:end], message_id, sysid, compid, seq, message, payload), check
 
 
 @dataclass(slots=True)
@@ -106,7 +115,7 @@ class Splitter:
                 found = candidate(data, start)
                 # An unknown id is a frame only if another one begins right behind it: one byte decides, and where it
                 # has not arrived yet we wait for it, so that the answer does not depend on how the bytes were sliced.
-                if found is not None and not found[1]:
+                if found is not None and found[1] is Check.UNKNOWN:
                     behind = start + len(found[0].raw)
                     if behind == len(data):
                         raise IncompleteError
@@ -114,14 +123,13 @@ class Splitter:
                         found = None
             except IncompleteError:
                 break
-            if found is None:
-                if data[start] in (MAGIC_V1, MAGIC_V2):
-                    self.counts["bad_candidates"] += 1
+            if found is None or found[1] is Check.BAD:
+                self.counts["bad_crc"] += found is not None
                 self.counts["skipped_bytes"] += 1
                 start += 1
                 continue
-            frame, good = found
-            self.counts["frames" if good else "unknown_frames"] += 1
+            frame, check = found
+            self.counts["frames" if check is Check.GOOD else "unknown_frames"] += 1
             frames.append(frame)
             start += len(frame.raw)
         self._pending = data[start:]

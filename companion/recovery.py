@@ -83,6 +83,19 @@ class Stage(StrEnum):
     UNCERTAIN = "uncertain"  # the parameters may be half changed: the operator must look
 
 
+STAGE_WORDS: Final = {  # for people
+    Stage.READING: "reading the parameters",
+    Stage.SETTING: "changing the parameters",
+    Stage.CHECKING: "reading the parameters back",
+    Stage.VERIFYING: "watching whether it helps",
+    Stage.UNDOING: "putting the parameters back",
+    Stage.UNDO_CHECKING: "checking that they are back",
+    Stage.DONE: "changed and verified",
+    Stage.REFUSED: "nothing changed",
+    Stage.ROLLED_BACK: "put back as before",
+    Stage.UNCERTAIN: "parameters uncertain",
+}
+
 ENDED: Final = frozenset({Stage.DONE, Stage.REFUSED, Stage.ROLLED_BACK, Stage.UNCERTAIN})
 UNDO_ROUNDS: Final = 3  # putting back and reading back again, before it is called uncertain
 

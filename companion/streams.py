@@ -40,7 +40,7 @@ class Streams:
     wanted_hz: Mapping[str, float]
     missing: tuple[str, ...] = ()  # found missing in the end
     _round: int = -1  # 0, 1: intervals asked; 2: groups asked; 3: settled
-    _until_us: int = 0
+    until_us: int = 0  # the present count ends then
     _counts: Counter[str] = field(default_factory=Counter)
 
     def heard(self, message: str) -> None:
@@ -53,7 +53,7 @@ class Streams:
 
     def tick(self, now_us: int) -> list[Send]:
         """-> further requests; sets `missing` when nothing has helped."""
-        if self._round not in (0, 1, 2) or now_us < self._until_us:
+        if self._round not in (0, 1, 2) or now_us < self.until_us:
             return []
         lacking = [
             name
@@ -61,10 +61,11 @@ class Streams:
             if self._counts[name] < max(1.0, ENOUGH * rate_hz * CHECK_US * 1e-6)
         ]
         self._round = self._round + 1 if lacking else 3
+        looked_us = self.until_us  # not now_us: nothing may depend on when somebody happened to look
         if self._round == 1:
-            return self._intervals({name: self.wanted_hz[name] for name in lacking}, now_us)
+            return self._intervals({name: self.wanted_hz[name] for name in lacking}, looked_us)
         if self._round == 2:
-            self._begin_count(now_us)
+            self._begin_count(looked_us)
             groups = {GROUPS[name]: self.wanted_hz[name] for name in lacking if name in GROUPS}
             return [
                 Send("REQUEST_DATA_STREAM", {"req_stream_id": group, "req_message_rate": round(rate_hz), "start_stop": 1})
@@ -83,4 +84,4 @@ class Streams:
 
     def _begin_count(self, now_us: int) -> None:
         self._counts.clear()
-        self._until_us = now_us + CHECK_US
+        self.until_us = now_us + CHECK_US

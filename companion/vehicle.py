@@ -89,20 +89,21 @@ class Watch:
             self._heard_first_us = arrival_us
         self._candidates.setdefault(beat.sysid, beat)
 
-    def choose(self, arrival_us: int) -> bool:
-        """Take a vehicle if the time has come; True at that moment."""
+    def choose(self, arrival_us: int) -> int | None:
+        """Take a vehicle if the time has come: the stamp at which it had come, once; else None."""
         if self.known or self._heard_first_us is None:
-            return False
-        if self.pinned_sysid is None and arrival_us - self._heard_first_us < CHOICE_US:
-            return False
+            return None
+        ripe_us = self._heard_first_us + (CHOICE_US if self.pinned_sysid is None else 0)
+        if arrival_us < ripe_us:
+            return None
         if len(self._candidates) > 1:
             self.rivals = tuple(sorted(self._candidates))
-            return False
+            return None
         (beat,) = self._candidates.values()
         self.sysid, self.compid, self.autopilot, self.type = beat.sysid, beat.compid, beat.autopilot, beat.type
-        self.heard_us = arrival_us
+        self.heard_us = ripe_us
         self.link = LinkState.UP
-        return True
+        return ripe_us
 
     def silence(self, arrival_us: int) -> tuple[LinkState, int] | None:
         """The next change of the link that silence has brought by now: (state, when); None if there is none."""

@@ -84,6 +84,10 @@ class Fleet(Protocol):
 
     channels: tuple[str, ...]
 
+    @property
+    def home(self) -> tuple[float, float, float]:
+        """What relative heights and the target count from: latitude, longitude (rad), altitude above sea level (m)."""
+
     def step(self, dt_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Advance every flight; -> (values, age_s), (flight, channel), as `observe`.  dt_s must not change in a flight."""
 

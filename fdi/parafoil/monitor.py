@@ -95,7 +95,9 @@ class Parafoil:
         self._input = np.array(config.observer.input)
         self._feedback = np.array(config.observer.feedback)
         self._output = np.array(model.output)
-        self._gain = -float(self._output @ np.linalg.solve(np.array(model.dynamics), np.array(model.input)))
+        steady = -np.linalg.solve(np.array(model.dynamics), np.array(model.input))  # state per metre held for ever
+        self._gain = float(self._output @ steady)
+        self._steady_turn = steady / self._gain  # state of a steady turn, per rad/s
         self._gap_rows = config.gap_s / config.period_s + 0.5
         limits = config.paper.thresholds
         self._thresholds = np.array(
@@ -142,7 +144,8 @@ class Parafoil:
 
         Motors and encoders go by output, turns by function: after a swap the left toggle is on output 2.  A swap is taken
         as the mending of crossed lines, so that the left function still pulls the left edge.  On a change the observers
-        go to rest, the windows are emptied and a verdict is taken back; the wind and heading filter goes on.
+        begin anew, the windows are emptied, a verdict is taken back and turns are not judged for the time of a warm-up,
+        which the vehicle needs to leave the spiral that a crossed one flies; the wind and heading filter goes on.
         """
         told = np.array([parameters.get(name, self.functions[i, flight]) for i, name in enumerate(PARAMETERS)])
         if np.array_equal(told, self.functions[:, flight], equal_nan=True):
@@ -151,6 +154,7 @@ class Parafoil:
         self._assign()
         flights = np.array([flight])
         self._restart_turns(flights)
+        self.warm_up[flights] = self._rows(self.config.warm_up_s)  # leaving a spiral is beyond the linear model
         self._forget_motors(flights)
         self.isolation.clear(flights)
 
@@ -217,8 +221,11 @@ class Parafoil:
         self.isolation.clear(flights)
 
     def _restart_turns(self, flights: IntArray) -> None:
-        """Observers to rest, their windows empty."""
-        self.observers[..., flights] = 0.0
+        """Observers into the steady turn that the filter sees (to rest in straight flight), their windows empty.
+
+        From rest a vehicle found in a spiral would look faulty for as long as the observers need to follow.
+        """
+        self.observers[..., flights] = self._steady_turn[:, None, None] * self.air[HEADING_RATE, flights]
         self.turn_ago[flights] = math.inf
         self.isolation.quiet[flights] = 0.0
         self.heading_rate.empty(flights)

@@ -23,7 +23,7 @@ from sitl.autopilot.mission import MissionItem
 from sitl.autopilot.parameters import INT32, REAL32, Parameters
 from sitl.autopilot.routing import EVERYBODY, MOST_CLIENTS, NOT_FORWARDED, Client, Due, Routes, is_ours
 from sitl.autopilot.streams import REQUEST_GROUPS, StreamTable
-from sitl.vehicle import Fleet, Stream, Vehicle
+from sitl.vehicle import Fleet, Vehicle
 
 Rates = Literal["stock", "fast"]
 
@@ -77,7 +77,6 @@ class Autopilot:
         compid: int = 1,
         rates: Rates = "stock",
         release_s: float | None = 5.0,
-        home: Home | None = None,
         mission: Sequence[MissionItem] = (),
         unix_us: int = 0,
         seed: int = 0,
@@ -87,7 +86,6 @@ class Autopilot:
         """An autopilot at boot time 0, standing still.
 
         fleet: one flight.  release_s: boot time at which it arms and releases itself, None: only when told to arm.
-        home: by default where the airframe's GLOBAL_POSITION_INT counts height from, below the first position.
         unix_us: Unix time at the first boot, 0: not known.  seed: of the links that SIM_LINK_* spoils.
         param_errors: say PARAM_ERROR where an ArduPilot of before 2025 is silent.
         Raises KeyError for a stream that the fleet's channels or the dialect do not cover, ValueError for a parameter
@@ -123,7 +121,7 @@ class Autopilot:
         self._later: list[_Later] = []
         self._table = StreamTable(vehicle.streams, fleet.channels)
         self._see(*fleet.observe())
-        self.home = home if home is not None else _home_below(vehicle.streams, self._row_by_channel())
+        self.home = Home(*fleet.home)
         self._sources = self._build_sources(rates)
         self._by_id = {source.id: index for index, source in enumerate(self._sources)}
         self._built: dict[int, Packed | None] = {}
@@ -387,9 +385,6 @@ class Autopilot:
         self._table.take(values[0], age_s[0], self.time_us)
         self._built = {}
 
-    def _row_by_channel(self) -> dict[str, float]:
-        return dict(zip(self.fleet.channels, self._values.tolist(), strict=True))
-
     def _disarmed(self, text: str) -> None:
         self.armed = False
         self.say(Severity.INFO, text)
@@ -542,11 +537,3 @@ def _step_s(vehicle: Vehicle, rates: Rates) -> float:
 
 def _packer(table: StreamTable, index: int) -> Callable[[], Packed | None]:
     return lambda: table.pack(index)
-
-
-def _home_below(streams: Sequence[Stream], row: dict[str, float]) -> Home:
-    """What the airframe's relative heights count from, at its first position; zero for airframes without one."""
-    fields = {f.name: row[f.channel] for s in streams if s.message == "GLOBAL_POSITION_INT" for f in s.fields}
-    if not {"lat", "lon", "alt", "relative_alt"} <= fields.keys() or any(value != value for value in fields.values()):
-        return Home()
-    return Home(fields["lat"], fields["lon"], fields["alt"] - fields["relative_alt"])

@@ -113,6 +113,12 @@ class Fleet:
         return self._t_ms / 1000.0
 
     @property
+    def home(self) -> tuple[float, float, float]:
+        """The target on the ground: latitude, longitude (rad), altitude above sea level (m)."""
+        latitude_rad, longitude_rad, altitude_m = (float(value) for value in self._home)
+        return latitude_rad, longitude_rad, altitude_m
+
+    @property
     def landed(self) -> NDArray[np.bool_]:
         """(flight,), True from touchdown on."""
         return np.asarray(self._flights.landed_ms >= 0)

@@ -77,6 +77,14 @@ class Fleet:
         self._landed = np.zeros(flights, dtype=bool)
 
     @property
+    def home(self) -> tuple[float, float, float]:
+        latitude_rad, longitude_rad = (
+            math.radians(self._config.home_latitude_deg),
+            math.radians(self._config.home_longitude_deg),
+        )
+        return latitude_rad, longitude_rad, 400.0
+
+    @property
     def landed(self) -> np.ndarray:
         return self._landed.copy()
 

@@ -1,0 +1,161 @@
+"""What a log says: the live core fed from a file, and the one JSON object that comes out.
+
+A log that our own run recorded also holds what that run sent; the replay decides again and compares instead of sending.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from companion import airframe as airframes
+from companion.airframe import Airframe
+from companion.core import FIRST_COMPONENT, LAST_COMPONENT, POLICIES, Core
+from companion.decision import Policy
+from companion.dialect import encode
+from companion.effects import Effect, Send
+from companion.errors import UserError
+from companion.events import SCHEMA, Json
+from companion.frames import Frame, Splitter
+from companion.journal import Journal
+from companion.tlog import LINK_MASK, OWN_LINK, PLAUSIBLE_US, Reader, Record
+from companion.vehicle import NO_VEHICLE, Heartbeat, heartbeat
+
+UNCOMPARED: Final = frozenset({"HEARTBEAT", "TIMESYNC"})  # they go out by the clock of the loop, and decide nothing
+
+
+@dataclass(slots=True)
+class Replay:
+    """One log through the core.  policy None: the one under which it was recorded, else advise."""
+
+    airframe: Airframe
+    policy: Policy | None = None
+    core: Core = field(init=False)
+    journal: Journal = field(init=False)
+    sent: list[bytes] = field(default_factory=list)  # what the replay would send: message ids and payloads
+    recorded: list[bytes] = field(default_factory=list)  # what the recorded run did send
+    observe: Callable[[Effect], None] | None = None
+    _stamp_us: int = 0
+
+    def __post_init__(self) -> None:
+        self.core = Core(self.airframe, self.policy or Policy.ADVISE)
+        self.journal = Journal(self.airframe)
+
+    def take(self, record: Record) -> None:
+        """One record; arrival stamps never run backwards here, whatever the file says."""
+        if record.stamp_us is not None and record.stamp_us in PLAUSIBLE_US:
+            self._stamp_us = max(self._stamp_us, record.stamp_us & ~LINK_MASK)
+        if self._is_own(record):
+            self._own(record.frame)
+        else:
+            self._perform(self.core.frame(record.frame, self._stamp_us))
+
+    def _is_own(self, record: Record) -> bool:
+        return record.link == OWN_LINK and FIRST_COMPONENT <= record.frame.compid <= LAST_COMPONENT
+
+    def _own(self, frame: Frame) -> None:
+        self._perform(self.core.tick(self._stamp_us))
+        if frame.name == "HEARTBEAT" and self.policy is None:
+            mode = heartbeat(frame).mode
+            if mode < len(POLICIES):
+                self.core.policy = POLICIES[mode]
+        if frame.name not in UNCOMPARED:
+            self.recorded.append(_content(frame))
+
+    def _perform(self, effects: list[Effect]) -> None:
+        self.journal.take(effects, self.core.watch.sysid)
+        for effect in effects:
+            if isinstance(effect, Send) and effect.message not in UNCOMPARED:
+                raw = encode(effect.message, effect.fields, sysid=1, compid=1, seq=0)
+                self.sent.append(_content(Splitter().feed(raw)[0]))
+            if self.observe is not None:
+                self.observe(effect)
+
+
+def _content(frame: Frame) -> bytes:
+    return frame.message_id.to_bytes(3, "little") + frame.payload
+
+
+@dataclass(frozen=True, slots=True)
+class Analysis:
+    """The outcome of one log."""
+
+    replay: Replay
+    content: dict[str, Json]  # the JSON object of ARCHITECTURE.md, "Analysis"
+
+    @property
+    def faults(self) -> list[dict[str, Json]]:
+        return self.replay.journal.faults
+
+
+def analyze(
+    path: Path,
+    choose: Callable[[list[Heartbeat]], Airframe],
+    policy: Policy | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Analysis:
+    """Read a log and say what happened.
+
+    choose: from the heartbeats of the vehicles in the log to the airframe; progress: told the number of frames read.
+    Raises UserError for a log that cannot be read.
+    """
+    reader = Reader(path)
+    records = list(_counted(reader, progress))
+    vehicles: dict[tuple[int, int], Heartbeat] = {}
+    for record in records:
+        if record.frame.name == "HEARTBEAT":
+            beat = heartbeat(record.frame)
+            if beat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and beat.type not in NO_VEHICLE:
+                vehicles.setdefault((beat.sysid, beat.compid), beat)
+    replay = Replay(choose(list(vehicles.values())), policy)
+    for record in records:
+        replay.take(record)
+    report = reader.report
+    first_us, last_us = report.first_us, report.last_us
+    content: dict[str, Json] = {
+        "schema": SCHEMA,
+        "log": {"path": str(path), "bytes": report.bytes, "sha256": report.sha256},
+        "reader": report.as_json(),
+        "vehicles": [
+            {
+                "sysid": beat.sysid,
+                "compid": beat.compid,
+                "autopilot": beat.autopilot,
+                "type": beat.type,
+                "airframe": replay.airframe.name if beat.sysid == replay.core.watch.sysid else None,
+            }
+            for beat in vehicles.values()
+        ],
+        "duration_s": (last_us - first_us) / 1e6 if first_us is not None and last_us is not None else None,
+        "verdict": replay.journal.verdict,
+        "faults": list(replay.journal.faults),
+        "checks": [],
+        "events": list(replay.journal.lines),
+    }
+    if replay.recorded:
+        content["replay"] = {
+            "sends": len(replay.sent),
+            "sends_recorded": len(replay.recorded),
+            "same_sends": replay.sent == replay.recorded,
+        }
+    return Analysis(replay, content)
+
+
+def _counted(reader: Reader, progress: Callable[[int], None] | None) -> Iterator[Record]:
+    for number, record in enumerate(reader):
+        if progress is not None and number % 10_000 == 0:
+            progress(number)
+        yield record
+
+
+def by_type(beats: list[Heartbeat], owners: Path | None = None) -> Airframe:
+    """The configured airframe that names the type of one of these vehicles.  Raises UserError if none does."""
+    found = {name: airframes.load(name, owners) for name in airframes.places()}
+    for beat in beats:
+        for airframe in found.values():
+            if beat.type in airframe.configuration.vehicle.mav_types:
+                return airframe
+    types = ", ".join(str(beat.type) for beat in beats) or "none heard"
+    raise UserError(f"no airframe is configured for MAV_TYPE {types}; name one with --airframe: {', '.join(found)}")

@@ -1,0 +1,88 @@
+"""`mavfdi run AIRFRAME`: beside an autopilot, or beside a simulator."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from companion import airframe as airframes
+from companion.cli import arguments
+from companion.core import FIRST_COMPONENT, LAST_COMPONENT, Core
+from companion.decision import Policy
+from companion.effects import Effect, Tell
+from companion.errors import UserError
+from companion.journal import Journal
+from companion.live import Live
+from companion.recorder import Recorder, load_record
+from companion.recovery import from_record
+
+DEFAULT_LINK = "udpin:127.0.0.1:14550"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("airframe")
+    arguments.add_connect(parser, DEFAULT_LINK)
+    parser.add_argument("--policy", choices=[policy.value for policy in Policy], default=Policy.ADVISE.value)
+    parser.add_argument(
+        "--out", metavar="DIR", type=Path, default=Path("mavfdi-out"), help="folder for log, events, summary"
+    )
+    arguments.add_config(parser)
+    parser.add_argument("--duration", metavar="S", type=float, help="stop after so many seconds")
+    arguments.add_speedup(parser)
+    parser.add_argument("--sysid", type=int, help="listen to this system only; default: the first autopilot heard")
+    parser.add_argument("--compid", type=int, help=f"our component id; default {FIRST_COMPONENT}, moving on if it is taken")
+    parser.add_argument("--quiet", action="store_true", help="do not print events")
+
+
+def main(args: argparse.Namespace) -> int:
+    if args.compid is not None and not FIRST_COMPONENT <= args.compid <= LAST_COMPONENT:
+        raise UserError(
+            f"--compid {args.compid} is none for an onboard computer; give {FIRST_COMPONENT} to {LAST_COMPONENT}"
+        )
+    airframe = airframes.load(args.airframe, args.config)
+    clock = arguments.companion_clock(args.speedup)
+    record = read_record(args.out)
+    links = arguments.open_links(args.connect, DEFAULT_LINK, lambda text: print(text, file=sys.stderr))
+    core = Core(
+        airframe,
+        Policy(args.policy),
+        pinned_sysid=args.sysid,
+        record=record,
+        compid=args.compid or FIRST_COMPONENT,
+        pinned_compid=args.compid is not None,
+    )
+    observe = None if args.quiet else show
+    live = Live(core, links, clock, Recorder(args.out), Journal(airframe), observe)
+
+    def stop(why: str) -> None:
+        live.stop = why
+
+    arguments.on_stop_signal(stop)
+    names = ", ".join(link.name for link in links)
+    print(f"mavfdi: {airframe.name} on {names}, policy {args.policy}, recording to {live.recorder.tlog_path}", flush=True)
+    try:
+        content = live.run(args.duration)
+    finally:
+        for link in links:
+            link.close()
+    print(f"mavfdi: {live.stop}; verdict {content['verdict']}", flush=True)
+    return 0
+
+
+def read_record(folder: Path) -> str:
+    """What a killed run left there.  Raises UserError for a record that is damaged: somebody must look at the vehicle."""
+    record = load_record(folder)
+    if record:
+        try:
+            from_record(record)
+        except ValueError as error:
+            raise UserError(f"{folder}/recovery.json: {error}; check the vehicle's outputs, then remove it") from None
+    return record
+
+
+def show(effect: Effect) -> None:
+    """One event, one line."""
+    if isinstance(effect, Tell):
+        event = effect.event
+        t = f"{event.t:8.1f}" if event.t is not None else "       -"
+        reason = f" ({event.reason})" if event.reason else ""
+        print(f"{t} s  {event.severity.value:9} {event.kind.value}/{event.name}: {event.text}{reason}", flush=True)
