@@ -9,6 +9,7 @@ import errno
 import socket
 from collections import Counter
 from collections.abc import Callable, Hashable
+from dataclasses import replace
 from typing import Any, Final, Protocol
 
 import serial
@@ -97,6 +98,8 @@ class UdpListener:
         except OSError:
             self._socket.close()
             raise
+        if not address.port:  # any free one
+            self.name = replace(address, port=self._socket.getsockname()[1]).canonical
 
     def filenos(self) -> list[int]:
         return [self._socket.fileno()]

@@ -4,6 +4,7 @@ It moves bytes, stamps, records and lines; what they mean is decided in `compani
 """
 
 import select
+import time
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -45,26 +46,35 @@ class Live:
     _maintained_us: int = 0
     _full_told: bool = False
 
-    def run(self, duration_s: float | None = None, details: dict[str, Json] | None = None) -> dict[str, Json]:
-        """Until told to stop or for duration_s of the clock; -> the summary, which is also written."""
+    def run(
+        self,
+        duration_s: float | None = None,
+        details: dict[str, Json] | None = None,
+        ended: Callable[[], str] | None = None,
+    ) -> dict[str, Json]:
+        """Until told to stop, for duration_s of the clock, or until `ended` says why; -> the summary, also written."""
         began_us = self.clock.now_us()
         extra: dict[str, Json] = {"policy": self.core.policy.value, "links": [link.name for link in self.links]}
         self.recorder.event(self.journal.begin(began_us, extra | (details or {})))
         while not self.stop:
-            now_us = self.clock.now_us()
-            if duration_s is not None and now_us - began_us >= round(duration_s * 1e6):
+            if duration_s is not None and self.clock.now_us() - began_us >= round(duration_s * 1e6):
                 self.stop = "duration reached"
-            self._maintain(now_us)
+            if self._maintain() and ended is not None and (why := ended()):
+                self.stop = why
             self._read()
             self._perform(self.core.tick(self.clock.now_us()))
             self._watch_disk()
         return self._finish(details or {})
 
-    def _maintain(self, now_us: int) -> None:
-        if abs(now_us - self._maintained_us) >= MAINTENANCE_US:
-            self._maintained_us = now_us
-            for link in self.links:
-                link.maintain(now_us)
+    def _maintain(self) -> bool:
+        """Look after the links now and then: by real time, which runs in lockstep too."""
+        now_us = time.monotonic_ns() // 1000
+        if now_us - self._maintained_us < MAINTENANCE_US:
+            return False
+        self._maintained_us = now_us
+        for link in self.links:
+            link.maintain(now_us)
+        return True
 
     def _read(self) -> None:
         waiting = [fileno for link in self.links for fileno in link.filenos()]
