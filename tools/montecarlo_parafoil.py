@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 import fdi.parafoil as detector
 import sitl.parafoil as simulator
 from fdi.verdict import NO_FAULT, Phase
+from intervals import share
 from sitl.vehicle import Injected
 from sitl.wire import quantiser
 
@@ -86,22 +87,6 @@ class Outcomes:
     inconclusive: NDArray[np.bool_]
     right: NDArray[np.bool_]
     namings: tuple[Naming, ...]
-
-
-def wilson(count: int, of: int) -> tuple[float, float]:
-    """95 % interval of a share."""
-    if of == 0:
-        return math.nan, math.nan
-    z = 1.959963984540054
-    share, spread = count / of, z * z / of
-    middle = (share + spread / 2.0) / (1.0 + spread)
-    half = z / (1.0 + spread) * math.sqrt(share * (1.0 - share) / of + spread / (4.0 * of))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
-
-
-def share(count: int, of: int) -> str:
-    low, high = wilson(count, of)
-    return f"{count / of if of else math.nan:.3f} [{low:.3f}, {high:.3f}]"
 
 
 def quantiles(values: FloatArray) -> str:
