@@ -6,6 +6,7 @@ counted, and `maintain` opens again what can be opened again.  `open_link` raise
 
 import contextlib
 import errno
+import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Hashable
@@ -363,8 +364,9 @@ class SerialPort:
         if self._port is None:
             self.counts["send_errors"] += 1
             return
-        try:
-            self.counts["send_errors"] += not self._backlog.push(data, self._port.write)
+        handle = self._port.fileno()
+        try:  # not the port's own write: with a full buffer it tries again for ever
+            self.counts["send_errors"] += not self._backlog.push(data, lambda waiting: os.write(handle, waiting))
         except (OSError, serial.SerialException):
             self._drop()
 

@@ -63,7 +63,10 @@ class Monitor(Protocol):
 
     @property
     def state(self) -> dict[str, NDArray[np.float64]]:
-        """Everything the next step depends on, (flight, ...) arrays: comparable, resumable."""
+        """Everything the next step depends on, (flight, ...) arrays: comparable; assigned back, it resumes there."""
+
+    @state.setter
+    def state(self, state: Mapping[str, NDArray[np.float64]]) -> None: ...
 
     def step(self, values: NDArray[np.float64], age_s: NDArray[np.float64]) -> Verdict:
         """Judge one row of the grid.
