@@ -3,7 +3,7 @@
 A log that our own run recorded also holds what that run sent; the replay decides again and compares instead of sending.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,7 +20,7 @@ from companion.errors import UserError
 from companion.events import SCHEMA, Json
 from companion.frames import Frame, Splitter
 from companion.journal import Journal
-from companion.tlog import LINK_MASK, OWN_LINK, PLAUSIBLE_US, Reader, Record
+from companion.tlog import LINK_MASK, OWN_LINK, PLAUSIBLE_US, Reader, Record, Report
 from companion.vehicle import NO_VEHICLE, Heartbeat, heartbeat
 
 UNCOMPARED: Final = frozenset({"HEARTBEAT", "TIMESYNC"})  # they go out by the clock of the loop, and decide nothing
@@ -101,8 +101,7 @@ def analyze(
     choose: from the heartbeats of the vehicles in the log to the airframe; progress: told the number of frames read.
     Raises UserError for a log that cannot be read.
     """
-    reader = Reader(path)
-    records = list(_counted(reader, progress))
+    records, report = _open(path, progress)
     vehicles: dict[tuple[int, int], Heartbeat] = {}
     for record in records:
         if record.frame.name == "HEARTBEAT":
@@ -112,7 +111,6 @@ def analyze(
     replay = Replay(choose(list(vehicles.values())), policy)
     for record in records:
         replay.take(record)
-    report = reader.report
     first_us, last_us = report.first_us, report.last_us
     content: dict[str, Json] = {
         "schema": SCHEMA,
@@ -143,8 +141,22 @@ def analyze(
     return Analysis(replay, content)
 
 
-def _counted(reader: Reader, progress: Callable[[int], None] | None) -> Iterator[Record]:
-    for number, record in enumerate(reader):
+def _open(path: Path, progress: Callable[[int], None] | None) -> tuple[list[Record], Report]:
+    """All frames of a log: compiled where numba is installed, else one by one; the outcome is the same."""
+    try:
+        from companion import columns
+    except ModuleNotFoundError as error:
+        if error.name != "numba":
+            raise
+        reader = Reader(path)
+        return list(_counted(reader, progress)), reader.report
+    index = columns.read(path)
+    index.hash()
+    return list(_counted(index.records(), progress)), index.report
+
+
+def _counted(records: Iterable[Record], progress: Callable[[int], None] | None) -> Iterator[Record]:
+    for number, record in enumerate(records):
         if progress is not None and number % 10_000 == 0:
             progress(number)
         yield record

@@ -76,6 +76,11 @@ def definition(message_id: int) -> Definition | None:
     )
 
 
+def known_ids() -> dict[int, int]:
+    """CRC_EXTRA of every message id of the dialect."""
+    return {message_id: message.crc_extra for message_id, message in messages.mavlink_map.items()}
+
+
 @cache
 def by_name(name: str) -> Definition:
     """The definition of a message name.  Raises KeyError for a name that the dialect does not have."""

@@ -12,6 +12,8 @@ Rules, each with its reason:
 - Before a PARAM_SET leaves, the record that names its parameter is saved.  After a restart of the companion whatever was
   under way is put back, never continued.
 - Nothing is called rolled back before both parameters have been read back.
+- A reading back begins only when late answers to earlier requests have run out: an echo still on its way, of an older
+  value or of one that was never stored, would pass for what was read.
 - MAVLink has no atomic pair: between the two PARAM_SETs both outputs carry one function for a round trip.
 
 The vehicle's own system and component are checked by whoever feeds this machine.
@@ -98,6 +100,7 @@ STAGE_WORDS: Final = {  # for people
 
 ENDED: Final = frozenset({Stage.DONE, Stage.REFUSED, Stage.ROLLED_BACK, Stage.UNCERTAIN})
 UNDO_ROUNDS: Final = 3  # putting back and reading back again, before it is called uncertain
+LATE_ANSWERS: Final = 2  # times answer_s: whatever has not arrived by then never will
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,14 +200,14 @@ def hear(recovery: Recovery, plan: Plan, said: Said, now_us: int) -> Output:
             recovery = replace(recovery, changed=True)
             if place + 1 < len(plan.parameters):
                 return _set(recovery, plan, place + 1, now_us)
-            return _read(replace(recovery, stage=Stage.CHECKING, tries=0), plan, plan.parameters, now_us)
+            return _read_back(recovery, Stage.CHECKING, plan, now_us)
         case Stage.UNDOING:
             place = recovery.place
             if said.name != plan.parameters[place] or not same_value(said.value, recovery.original[place]):
                 return recovery, []
             return _undo_next(recovery, plan, now_us)
         case Stage.CHECKING | Stage.UNDO_CHECKING:
-            if said.name not in plan.parameters:
+            if said.name not in plan.parameters or recovery.tries == 0:  # not asked yet: a late answer
                 return recovery, []
             place = plan.parameters.index(said.name)
             answers = (*recovery.answers[:place], said.value, *recovery.answers[place + 1 :])
@@ -282,7 +285,7 @@ def rebooted(recovery: Recovery, plan: Plan, now_us: int) -> Output:
         case Stage.SETTING | Stage.CHECKING:
             return _undo(replace(recovery, reason="the autopilot rebooted during the change"), plan, now_us)
         case Stage.VERIFYING:
-            return _read(replace(recovery, stage=Stage.CHECKING, tries=0), plan, plan.parameters, now_us)
+            return _read_back(recovery, Stage.CHECKING, plan, now_us)
         case Stage.UNDOING | Stage.UNDO_CHECKING:
             return _undo(recovery, plan, now_us)
     return recovery, []
@@ -348,6 +351,12 @@ def _read(recovery: Recovery, plan: Plan, names: tuple[str, ...], now_us: int) -
     return recovery, [_request(name) for name in names]
 
 
+def _read_back(recovery: Recovery, stage: Stage, plan: Plan, now_us: int) -> Output:
+    """Wait for late answers to run out; the first deadline then asks."""
+    due_us = now_us + round(1e6 * LATE_ANSWERS * plan.answer_s)
+    return replace(recovery, stage=stage, tries=0, answers=(None,) * len(plan.parameters), due_us=due_us), []
+
+
 def _again_reading(recovery: Recovery, plan: Plan, now_us: int) -> Output:
     """Ask again for what has not answered; what has is kept."""
     missing = [name for name, value in zip(plan.read_first, recovery.answers, strict=True) if value is None]
@@ -383,7 +392,7 @@ def _undo_set(recovery: Recovery, plan: Plan, place: int, now_us: int) -> Output
 def _undo_next(recovery: Recovery, plan: Plan, now_us: int) -> Output:
     if recovery.place > 0:
         return _undo_set(replace(recovery, tries=0), plan, recovery.place - 1, now_us)
-    return _read(replace(recovery, stage=Stage.UNDO_CHECKING, tries=0), plan, plan.parameters, now_us)
+    return _read_back(recovery, Stage.UNDO_CHECKING, plan, now_us)
 
 
 def _kept(recovery: Recovery) -> Output:

@@ -70,7 +70,8 @@ class Rehearsal:
         self._deliver()
 
     def _drain(self) -> bytes:
-        return b"".join(frame for _, frame in self.autopilot.outgoing())
+        """What is for the companion; other clients that a test has put on the autopilot are served elsewhere."""
+        return b"".join(frame for key, frame in self.autopilot.outgoing() if key == COMPANION)
 
     def _hear(self, data: bytes) -> None:
         for frame in self._splitter.feed(data):
