@@ -7,6 +7,7 @@ reads frame by frame comes out here the same, faster by two orders of magnitude.
 import gzip
 import hashlib
 import mmap
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +21,11 @@ from companion.decode import WIRE_UNITS
 from companion.dialect import Definition, by_name, definition, known_ids
 from companion.errors import UserError
 from companion.frames import Frame
-from companion.tlog import LINK_MASK, PLAUSIBLE_US, Record, Report, Source
+from companion.tlog import PLAUSIBLE_US, Record, Report, Source
 
-BLOCK: Final = 1 << 18  # frames a call of the walk; between two the caller's progress is told
-KEPT: Final = 1 << 12  # failures and gaps noted a call
+BLOCK: Final = 1 << 18  # frames between two moments in which memory is given back
+SMALLEST: Final = 8  # bytes of the smallest frame, without a stamp
+NOTED: Final = 1 << 16  # failures and gaps that are remembered one by one
 DTYPES: Final[Mapping[str, str]] = {
     "uint8_t": "u1",
     "uint8_t_mavlink_version": "u1",
@@ -60,7 +62,7 @@ class Index:
 
     data: NDArray[np.uint8]
     starts: NDArray[np.int64]  # of the magic byte
-    ends: NDArray[np.int64]
+    sizes: NDArray[np.uint16]  # of the whole frame, signature included
     flags: NDArray[np.uint8]  # walk.UNSTAMPED, IS_V2, IS_SIGNED, IS_UNKNOWN
     ids: NDArray[np.int32]
     sources: NDArray[np.uint16]  # sysid * 256 + compid
@@ -75,16 +77,16 @@ class Index:
     def hash(self) -> None:
         """Fill in the report's two digests; apart from the reading, since they take longer than it."""
         self.report.sha256 = hashlib.sha256(self.data.data).hexdigest()
-        packed = np.empty(int((self.ends - self.starts).sum()), dtype=np.uint8)
-        walk.pack(self.data, self.starts, self.ends, packed)
+        packed = np.empty(int(self.sizes.sum(dtype=np.int64)), dtype=np.uint8)
+        walk.pack(self.data, self.starts, self.sizes, packed)
         self.report.frames_sha256 = hashlib.sha256(packed.data).hexdigest()
 
     def records(self) -> Iterator[Record]:
         """Frame by frame, as `tlog.Reader` gives them."""
         data = self.data.tobytes()
-        for start, end, flag, message_id, source, seq, stamp_us in zip(
+        for start, size, flag, message_id, source, seq, stamp_us in zip(
             self.starts.tolist(),
-            self.ends.tolist(),
+            self.sizes.tolist(),
             self.flags.tolist(),
             self.ids.tolist(),
             self.sources.tolist(),
@@ -92,7 +94,7 @@ class Index:
             self.stamps_us.tolist(),
             strict=True,
         ):
-            raw = data[start:end]
+            raw = data[start : start + size]
             body = 10 if flag & walk.IS_V2 else 6
             payload = raw[body : body + raw[1]]
             frame = Frame(raw, message_id, source >> 8, source & 0xFF, seq, definition(message_id), payload)
@@ -128,35 +130,68 @@ class Index:
         return self._columns(chosen)
 
     def _columns(self, chosen: NDArray[np.bool_]) -> dict[str, Columns]:
-        counts = np.bincount(self.ids[chosen], minlength=len(walk.seeds()))
+        ids = self.ids if chosen.all() else self.ids[chosen]
+        counts = np.bincount(ids, minlength=len(walk.seeds()))
         sizes = payload_sizes()
-        next_byte = np.concatenate(([0], np.cumsum(counts * sizes)))
         next_row = np.concatenate(([0], np.cumsum(counts)))
-        first_byte, first_row = next_byte.copy(), next_row.copy()
-        payloads = np.empty(int(next_byte[-1]), dtype=np.uint8)
-        frames = np.empty(int(next_row[-1]), dtype=np.int64)
-        walk.spread(self.data, self.starts, self.ids, chosen, sizes, next_byte, next_row, payloads, frames)
-        out: dict[str, Columns] = {}
+        first_row = next_row.copy()
+        frames = np.empty(len(ids), dtype=np.int64)
+        stamps_us = np.empty(len(ids), dtype=np.uint64)
+        sysids, compids = np.empty(len(ids), dtype=np.uint8), np.empty(len(ids), dtype=np.uint8)
+        found: dict[int, _Fields] = {}
         for message_id in np.flatnonzero(counts).tolist():
-            found = definition(message_id)
-            assert found is not None  # unknown ids were not chosen
-            rows = payloads[first_byte[message_id] : next_byte[message_id]].reshape(-1, int(sizes[message_id]))
-            numbers = frames[first_row[message_id] : next_row[message_id]]
-            out[found.name] = self._typed(found, numbers, rows)
+            message = definition(message_id)
+            assert message is not None  # unknown ids were not chosen
+            found[message_id] = _Fields(message, int(counts[message_id]))
+        for first in range(0, len(self), BLOCK):
+            part = slice(first, first + BLOCK)
+            counts = np.bincount(self.ids[part][chosen[part]], minlength=len(walk.seeds()))
+            ends = np.cumsum(counts * sizes)
+            payloads = np.empty(int(ends[-1]), dtype=np.uint8)
+            walk.spread(
+                *(self.data, first, self.starts[part], self.ids[part], self.sources[part], self.stamps_us[part]),
+                *(chosen[part], sizes, ends - counts * sizes, next_row, payloads, frames, stamps_us, sysids, compids),
+            )
+            for message_id in np.flatnonzero(counts).tolist():
+                end = int(ends[message_id])
+                size = int(sizes[message_id])
+                found[message_id].take(payloads[end - int(counts[message_id]) * size : end].reshape(-1, size))
+            _let_go(self.data)
+        out: dict[str, Columns] = {}
+        for message_id, fields in found.items():
+            own = slice(first_row[message_id], next_row[message_id])
+            name = fields.message.name
+            out[name] = Columns(name, frames[own], stamps_us[own], sysids[own], compids[own], fields.columns, fields.units)
         return out
 
-    def _typed(self, message: Definition, frames: NDArray[np.int64], rows: NDArray[np.uint8]) -> Columns:
-        structured = rows.view(row_dtype(message))[:, 0]
-        fields: dict[str, Column] = {}
-        units: dict[str, str] = {}
+
+class _Fields:
+    """The columns of one message type, filled block by block: payloads are converted while they are in the cache."""
+
+    def __init__(self, message: Definition, rows: int) -> None:
+        self.message = message
+        self.columns: dict[str, Column] = {}
+        self.units: dict[str, str] = {}
+        self._factors: dict[str, float] = {}
+        self._dtype = row_dtype(message)
+        self._filled = 0
         for name in message.fields:
-            units[name], factor = WIRE_UNITS.get(message.units.get(name, ""), ("1", 1.0))
-            raw = structured[name]
-            fields[name] = np.ascontiguousarray(raw) if factor == 1.0 else raw * factor
-        sources = self.sources[frames]
-        stamps_us = self.stamps_us[frames] & np.uint64(~LINK_MASK & 0xFFFF_FFFF_FFFF_FFFF)
-        sysid, compid = (sources >> 8).astype(np.uint8), sources.astype(np.uint8)
-        return Columns(message.name, frames, stamps_us, sysid, compid, fields, units)
+            self.units[name], self._factors[name] = WIRE_UNITS.get(message.units.get(name, ""), ("1", 1.0))
+            kind = self._dtype[name]
+            base = np.dtype(np.float64) if self._factors[name] != 1.0 else kind.base
+            self.columns[name] = np.empty((rows, *kind.shape), dtype=base)
+
+    def take(self, rows: NDArray[np.uint8]) -> None:
+        """Further payloads, (row, byte)."""
+        structured = rows.view(self._dtype)[:, 0]
+        place = slice(self._filled, self._filled + len(rows))
+        self._filled += len(rows)
+        for name, column in self.columns.items():
+            factor = self._factors[name]
+            if factor == 1.0:
+                column[place] = structured[name]
+            else:
+                np.multiply(structured[name], factor, out=column[place])
 
 
 def payload_sizes() -> NDArray[np.int64]:
@@ -182,30 +217,56 @@ def row_dtype(message: Definition) -> np.dtype[np.void]:
 def read(path: Path) -> Index:
     """Index a log, `.tlog` or `.tlog.gz`.  Raises UserError for a file that cannot be read or holds no frame."""
     data = _bytes(path)
-    starts: list[NDArray[np.int64]] = []
-    ends: list[NDArray[np.int64]] = []
-    flags: list[NDArray[np.uint8]] = []
-    block = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.uint8)
     counters = np.zeros(walk.COUNTERS, np.int64)
-    failed_ids, skips = np.empty(KEPT, np.int64), np.empty(2 * KEPT, np.int64)
-    report = Report(bytes=data.size)
-    gaps: list[tuple[int, int]] = []
-    position = 0
+    failed_ids, skips = np.empty(NOTED, np.int64), np.empty(2 * NOTED, np.int64)
+    # Room for as many frames as there can be: memory that is never touched is never taken.
+    room = data.size // SMALLEST + 1
+    starts, stamps_us = np.empty(room, np.int64), np.empty(room, np.uint64)
+    sizes, sources = np.empty(room, np.uint16), np.empty(room, np.uint16)
+    flags, seqs, ids = np.empty(room, np.uint8), np.empty(room, np.uint8), np.empty(room, np.int32)
+    count, position = 0, 0
     while position < data.size:
-        count, position, failures, gap_count = walk.walk(
-            data, position, walk.seeds(), walk.crc_tables(), *block, counters, failed_ids, skips
+        rest = slice(count, count + BLOCK)
+        more, position = walk.walk(
+            *(data, position, walk.seeds(), walk.crc_tables()),
+            *(part[rest] for part in (starts, sizes, flags, ids, sources, seqs, stamps_us)),
+            *(counters, failed_ids, skips),
         )
-        starts.append(block[0][:count].copy())
-        ends.append(block[1][:count].copy())
-        flags.append(block[2][:count].copy())
-        report.crc_failure_ids.update(failed_ids[:failures].tolist())
-        gaps += [(int(at), int(size)) for at, size in skips[:gap_count].reshape(-1, 2)][: KEPT - len(gaps)]
-    index = _described(data, np.concatenate(starts), np.concatenate(ends), np.concatenate(flags), report, tuple(gaps))
-    report.resyncs, report.resync_bytes = int(counters[walk.RESYNCS]), int(counters[walk.RESYNC_BYTES])
-    report.tail_bytes, report.crc_failures = int(counters[walk.TAIL_BYTES]), int(counters[walk.CRC_FAILURES])
-    if not len(index):
+        count += more
+        _let_go(data)
+    if not count:
         raise UserError(f"{path}: no MAVLink frame in {data.size} bytes; is it a telemetry log?")
+    gaps = skips[: 2 * min(NOTED, int(counters[walk.GAPS]))].reshape(-1, 2)
+    report = Report(
+        bytes=data.size,
+        resyncs=int(counters[walk.RESYNCS]),
+        resync_bytes=int(counters[walk.RESYNC_BYTES]),
+        tail_bytes=int(counters[walk.TAIL_BYTES]),
+        crc_failures=int(counters[walk.CRC_FAILURES]),
+        crc_failure_ids=Counter(failed_ids[: int(counters[walk.CRC_FAILURES])].tolist()),
+    )
+    index = Index(
+        data,
+        starts[:count],
+        sizes[:count],
+        flags[:count],
+        ids[:count],
+        sources[:count],
+        seqs[:count],
+        stamps_us[:count],
+        report,
+        tuple((int(at), int(size)) for at, size in gaps),
+    )
+    _fill_report(index)
     return index
+
+
+def _let_go(data: NDArray[np.uint8]) -> None:
+    """Pages of the file that were looked at need not stay ours: the system keeps them, and gives them again."""
+    view: object = data.base
+    mapping = view.obj if isinstance(view, memoryview) else None
+    if isinstance(mapping, mmap.mmap):
+        mapping.madvise(mmap.MADV_DONTNEED)
 
 
 def _bytes(path: Path) -> NDArray[np.uint8]:
@@ -218,23 +279,6 @@ def _bytes(path: Path) -> NDArray[np.uint8]:
             return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
     except (OSError, EOFError) as error:
         raise UserError(f"{path}: cannot read the log: {error}") from None
-
-
-def _described(
-    data: NDArray[np.uint8],
-    starts: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    flags: NDArray[np.uint8],
-    report: Report,
-    gaps: tuple[tuple[int, int], ...],
-) -> Index:
-    count = len(starts)
-    ids, sources = np.empty(count, np.int32), np.empty(count, np.uint16)
-    seqs, stamps_us = np.empty(count, np.uint8), np.empty(count, np.uint64)
-    walk.describe(data, starts, flags, ids, sources, seqs, stamps_us)
-    index = Index(data, starts, ends, flags, ids, sources, seqs, stamps_us, report, gaps)
-    _fill_report(index)
-    return index
 
 
 def _fill_report(index: Index) -> None:

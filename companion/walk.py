@@ -24,7 +24,7 @@ IS_SIGNED: Final = 4
 IS_UNKNOWN: Final = 8
 
 # columns of the counters that the walk keeps
-RESYNCS, RESYNC_BYTES, TAIL_BYTES, CRC_FAILURES, COUNTERS = 0, 1, 2, 3, 4
+RESYNCS, RESYNC_BYTES, TAIL_BYTES, CRC_FAILURES, GAPS, COUNTERS = 0, 1, 2, 3, 4, 5
 
 Bytes = NDArray[np.uint8]
 
@@ -136,11 +136,58 @@ def confirmed(data: Bytes, end: int, n: int, extras: NDArray[np.int16], tables: 
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
 def message_id_at(data: Bytes, q: int) -> int:
     if data[q] == 0xFD:
         return int(np.int64(data[q + 7]) | np.int64(data[q + 8]) << 8 | np.int64(data[q + 9]) << 16)
     return int(np.int64(data[q + 5]))
+
+
+@njit(cache=True)
+def find_again(
+    data: Bytes,
+    position: int,
+    n: int,
+    extras: NDArray[np.int16],
+    tables: NDArray[np.uint16],
+    counters: NDArray[np.int64],
+    failed_ids: NDArray[np.int64],
+    skips: NDArray[np.int64],
+) -> tuple[int, int, int]:
+    """The next frame where none stands one stamp behind `position`: (start, end, flags); start is n where there is none."""
+    end, flag = n, 0
+    found, bare_end = candidate(data, position, n, extras, tables)
+    if found == GOOD:
+        return position, bare_end, UNSTAMPED
+    status, _ = candidate(data, position + 8, n, extras, tables)
+    if status == BAD:
+        if counters[CRC_FAILURES] < failed_ids.shape[0]:
+            failed_ids[counters[CRC_FAILURES]] = message_id_at(data, position + 8)
+        counters[CRC_FAILURES] += 1
+    start, found = position, 0
+    while found != GOOD:
+        start += 1
+        if start >= n:
+            break
+        magic = data[start]
+        if (magic == 0xFD or magic == 0xFE) and start != position + 8:
+            found, end = candidate(data, start, n, extras, tables)
+    if found != GOOD:
+        start, skipped = n, n - position
+        counters[TAIL_BYTES] = skipped
+    elif start - 8 >= position:
+        skipped = start - 8 - position
+    else:
+        skipped, flag = start - position, UNSTAMPED
+    if skipped > 0:
+        gap = 2 * counters[GAPS]
+        if gap + 1 < skips.shape[0]:
+            skips[gap], skips[gap + 1] = position, skipped
+        counters[GAPS] += 1
+        if start < n:
+            counters[RESYNCS] += 1
+            counters[RESYNC_BYTES] += skipped
+    return start, end, flag
 
 
 @njit(cache=True)
@@ -150,118 +197,82 @@ def walk(
     extras: NDArray[np.int16],
     tables: NDArray[np.uint16],
     starts: NDArray[np.int64],
-    ends: NDArray[np.int64],
-    flags: NDArray[np.uint8],
-    counters: NDArray[np.int64],
-    failed_ids: NDArray[np.int64],
-    skips: NDArray[np.int64],
-) -> tuple[int, int, int, int]:
-    """Frames from `position` on, as many as the arrays hold.
-
-    starts, ends, flags: (frame,), filled; a stamp is the 8 bytes before the start unless UNSTAMPED.  counters: (COUNTERS,),
-    added to.  failed_ids, skips: ids of CRC failures, and (offset, length) in turn of skipped bytes, as far as they fit.
-    -> (frames, position to go on from, failed ids, skips).
-    """
-    n = data.shape[0]
-    count, failures, gaps = 0, 0, 0
-    while position < n and count < starts.shape[0]:
-        status, end = first_candidate(data, position + 8, n, extras, tables)
-        if status == GOOD or (status == UNKNOWN and confirmed(data, end, n, extras, tables)):
-            start, flag = position + 8, 0
-            if status == UNKNOWN:
-                flag = IS_UNKNOWN
-        else:
-            bare, bare_end = candidate(data, position, n, extras, tables)
-            if bare == GOOD:
-                start, end, flag = position, bare_end, UNSTAMPED
-            else:
-                if status == BAD:
-                    counters[CRC_FAILURES] += 1
-                    if failures < failed_ids.shape[0]:
-                        failed_ids[failures] = message_id_at(data, position + 8)
-                        failures += 1
-                start = position
-                found = 0
-                while found != GOOD:
-                    start += 1
-                    if start >= n:
-                        break
-                    magic = data[start]
-                    if (magic == 0xFD or magic == 0xFE) and start != position + 8:
-                        found, end = candidate(data, start, n, extras, tables)
-                if found != GOOD:
-                    counters[TAIL_BYTES] = n - position
-                    if gaps + 1 < skips.shape[0]:
-                        skips[gaps], skips[gaps + 1] = position, n - position
-                        gaps += 2
-                    position = n
-                    break
-                if start - 8 >= position:
-                    skipped, flag = start - 8 - position, 0
-                else:
-                    skipped, flag = start - position, UNSTAMPED
-                if skipped > 0:
-                    counters[RESYNCS] += 1
-                    counters[RESYNC_BYTES] += skipped
-                    if gaps + 1 < skips.shape[0]:
-                        skips[gaps], skips[gaps + 1] = position, skipped
-                        gaps += 2
-        if data[start] == 0xFD:
-            flag |= IS_V2
-            if data[start + 2] & 1:
-                flag |= IS_SIGNED
-        starts[count] = start
-        ends[count] = end
-        flags[count] = flag
-        count += 1
-        position = end
-    return count, position, failures, gaps
-
-
-@njit(cache=True)
-def describe(
-    data: Bytes,
-    starts: NDArray[np.int64],
+    sizes: NDArray[np.uint16],
     flags: NDArray[np.uint8],
     ids: NDArray[np.int32],
     sources: NDArray[np.uint16],
     seqs: NDArray[np.uint8],
     stamps_us: NDArray[np.uint64],
-) -> None:
-    """Per frame: message id, sysid * 256 + compid, sequence number, stamp as it stands (0 where there is none)."""
-    for f in range(starts.shape[0]):
-        q = starts[f]
-        ids[f] = message_id_at(data, q)
-        if data[q] == 0xFD:
-            seqs[f] = data[q + 4]
-            sources[f] = np.uint16(data[q + 5]) * np.uint16(256) + np.uint16(data[q + 6])
+    counters: NDArray[np.int64],
+    failed_ids: NDArray[np.int64],
+    skips: NDArray[np.int64],
+) -> tuple[int, int]:
+    """Frames from `position` on, as many as the arrays hold: (frames, position to go on from).
+
+    starts to stamps_us: (frame,), filled; see `columns.Index`.  counters: (COUNTERS,), added to.  failed_ids, skips: ids of
+    CRC failures, and (offset, length) in turn of skipped bytes, from the first of the log on, as many as fit.
+    """
+    n = data.shape[0]
+    count, room = 0, starts.shape[0]
+    while position >= 0 and position < n and count < room:  # said to be positive: spares a test at each look-up
+        start = position + 8
+        flag = 0
+        status, end = first_candidate(data, start, n, extras, tables)
+        if status != GOOD:
+            if status == UNKNOWN and confirmed(data, end, n, extras, tables):
+                flag = IS_UNKNOWN
+            else:
+                start, end, flag = find_again(data, position, n, extras, tables, counters, failed_ids, skips)
+                if start >= n:
+                    position = n
+                    break
+        if data[start] == 0xFD:
+            flag |= IS_V2
+            if data[start + 2] & 1:
+                flag |= IS_SIGNED
+            seqs[count] = data[start + 4]
+            sources[count] = np.uint16(data[start + 5]) << np.uint16(8) | np.uint16(data[start + 6])
         else:
-            seqs[f] = data[q + 2]
-            sources[f] = np.uint16(data[q + 3]) * np.uint16(256) + np.uint16(data[q + 4])
+            seqs[count] = data[start + 2]
+            sources[count] = np.uint16(data[start + 3]) << np.uint16(8) | np.uint16(data[start + 4])
         stamp = np.uint64(0)
-        if not flags[f] & UNSTAMPED:
-            for k in range(q - 8, q):
+        if not flag & UNSTAMPED:
+            for k in range(start - 8, start):
                 stamp = stamp << np.uint64(8) | np.uint64(data[k])
-        stamps_us[f] = stamp
+        starts[count] = start
+        sizes[count] = end - start
+        flags[count] = flag
+        ids[count] = message_id_at(data, start)
+        stamps_us[count] = stamp
+        count += 1
+        position = end
+    return count, position
 
 
 @njit(cache=True)
 def spread(
     data: Bytes,
+    first: int,
     starts: NDArray[np.int64],
     ids: NDArray[np.int32],
+    sources: NDArray[np.uint16],
+    stamps_us: NDArray[np.uint64],
     chosen: NDArray[np.bool_],
     sizes: NDArray[np.int64],
     next_byte: NDArray[np.int64],
     next_row: NDArray[np.int64],
     payloads: Bytes,
-    frames: NDArray[np.int64],
+    row_frames: NDArray[np.int64],
+    row_stamps_us: NDArray[np.uint64],
+    row_sysids: NDArray[np.uint8],
+    row_compids: NDArray[np.uint8],
 ) -> None:
     """Payloads of the chosen frames, type by type, cut or filled with zeros to the size of the definition.
 
-    chosen: (frame,).  sizes: by message id; next_byte, next_row: by message id, where its next payload and its next frame
-    number go, both moved on.  payloads: flat bytes, frames: flat numbers, both filled.  One pass in the order of the file:
-    gathering type by type goes through memory once a type, and takes ten times as long.
+    first: number of the first frame given.  starts to chosen: (frame,).  sizes: by message id; next_byte, next_row: by
+    message id, where its next payload and its next row go, both moved on.  payloads: flat bytes, row_*: flat by row, all
+    filled; stamps without the link's bits.  One pass in the order of the file: gathering type by type goes through memory
+    once a type, and takes ten times as long.
     """
     for f in range(starts.shape[0]):
         if not chosen[f]:
@@ -273,8 +284,12 @@ def spread(
         length = min(np.int64(data[q + 1]), size)
         to = next_byte[message_id]
         next_byte[message_id] = to + size
-        frames[next_row[message_id]] = f
-        next_row[message_id] += 1
+        row = next_row[message_id]
+        next_row[message_id] = row + 1
+        row_frames[row] = first + f
+        row_stamps_us[row] = stamps_us[f] & ~np.uint64(3)
+        row_sysids[row] = sources[f] >> np.uint16(8)
+        row_compids[row] = sources[f] & np.uint16(0xFF)
         source, target = data[body : body + length], payloads[to : to + length]
         for k in range(length):
             target[k] = source[k]
@@ -283,11 +298,12 @@ def spread(
 
 
 @njit(cache=True)
-def pack(data: Bytes, starts: NDArray[np.int64], ends: NDArray[np.int64], packed: Bytes) -> None:
+def pack(data: Bytes, starts: NDArray[np.int64], sizes: NDArray[np.uint16], packed: Bytes) -> None:
     """The bytes of all frames, one behind the other."""
     to = 0
     for f in range(starts.shape[0]):
-        source, target = data[starts[f] : ends[f]], packed[to : to + ends[f] - starts[f]]
-        for k in range(source.shape[0]):
+        size = int(sizes[f])
+        source, target = data[starts[f] : starts[f] + size], packed[to : to + size]
+        for k in range(size):
             target[k] = source[k]
-        to += source.shape[0]
+        to += size
