@@ -23,6 +23,7 @@ from companion.journal import Journal
 from companion.tlog import LINK_MASK, OWN_LINK, PLAUSIBLE_US, Reader, Record, Report
 from companion.vehicle import NO_VEHICLE, Heartbeat, heartbeat
 
+HEARTBEAT_ID: Final = 0
 UNCOMPARED: Final = frozenset({"HEARTBEAT", "TIMESYNC"})  # they go out by the clock of the loop, and decide nothing
 
 
@@ -102,31 +103,12 @@ def analyze(
     Raises UserError for a log that cannot be read.
     """
     records, report = _open(path, progress)
-    vehicles: dict[tuple[int, int], Heartbeat] = {}
-    for record in records:
-        if record.frame.name == "HEARTBEAT":
-            beat = heartbeat(record.frame)
-            if beat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and beat.type not in NO_VEHICLE:
-                vehicles.setdefault((beat.sysid, beat.compid), beat)
-    replay = Replay(choose(list(vehicles.values())), policy)
+    vehicles = _vehicles(records)
+    replay = Replay(choose(vehicles), policy)
     for record in records:
         replay.take(record)
-    first_us, last_us = report.first_us, report.last_us
     content: dict[str, Json] = {
-        "schema": SCHEMA,
-        "log": {"path": str(path), "bytes": report.bytes, "sha256": report.sha256},
-        "reader": report.as_json(),
-        "vehicles": [
-            {
-                "sysid": beat.sysid,
-                "compid": beat.compid,
-                "autopilot": beat.autopilot,
-                "type": beat.type,
-                "airframe": replay.airframe.name if beat.sysid == replay.core.watch.sysid else None,
-            }
-            for beat in vehicles.values()
-        ],
-        "duration_s": (last_us - first_us) / 1e6 if first_us is not None and last_us is not None else None,
+        **_facts(path, report, vehicles, replay.airframe.name, replay.core.watch.sysid),
         "verdict": replay.journal.verdict,
         "faults": list(replay.journal.faults),
         "checks": [],
@@ -139,6 +121,45 @@ def analyze(
             "same_sends": replay.sent == replay.recorded,
         }
     return Analysis(replay, content)
+
+
+def facts(path: Path) -> dict[str, Json]:
+    """What is in a log: an analysis without verdict, faults, checks and events.  Raises UserError as `analyze`."""
+    records, report = _open(path, None)
+    return _facts(path, report, _vehicles(records), None, None)
+
+
+def _vehicles(records: Iterable[Record]) -> list[Heartbeat]:
+    """The first heartbeat of each component that flies."""
+    found: dict[tuple[int, int], Heartbeat] = {}
+    for record in records:
+        if record.frame.message_id == HEARTBEAT_ID:
+            beat = heartbeat(record.frame)
+            if beat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and beat.type not in NO_VEHICLE:
+                found.setdefault((beat.sysid, beat.compid), beat)
+    return list(found.values())
+
+
+def _facts(
+    path: Path, report: Report, vehicles: list[Heartbeat], airframe: str | None, sysid: int | None
+) -> dict[str, Json]:
+    first_us, last_us = report.first_us, report.last_us
+    return {
+        "schema": SCHEMA,
+        "log": {"path": str(path), "bytes": report.bytes, "sha256": report.sha256},
+        "reader": report.as_json(),
+        "vehicles": [
+            {
+                "sysid": beat.sysid,
+                "compid": beat.compid,
+                "autopilot": beat.autopilot,
+                "type": beat.type,
+                "airframe": airframe if beat.sysid == sysid else None,
+            }
+            for beat in vehicles
+        ],
+        "duration_s": (last_us - first_us) / 1e6 if first_us is not None and last_us is not None else None,
+    }
 
 
 def _open(path: Path, progress: Callable[[int], None] | None) -> tuple[list[Record], Report]:

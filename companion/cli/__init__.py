@@ -17,6 +17,8 @@ COMMANDS: Final = {  # name -> what `mavfdi --help` says of it
     "sitl": "fly a simulated vehicle that speaks MAVLink",
     "demo": "fly, break, watch and mend in one go",
     "analyze": "say what happened in telemetry logs",
+    "info": "print what is in telemetry logs, without judging",
+    "export": "write a log's messages as Parquet or CSV",
     "config": "print an airframe's configuration and where each value comes from",
 }
 FAILED: Final = 2

@@ -33,6 +33,20 @@ def add_speedup(parser: argparse.ArgumentParser, default: str = "1") -> None:
     )
 
 
+def add_duration(parser: argparse.ArgumentParser, text: str) -> None:
+    parser.add_argument("--duration", metavar="S", type=float, help=text)
+
+
+def check_numbers(*, duration_s: float | None = None, sysid: int | None = None, seed: int | None = None) -> None:
+    """What argparse took for numbers must be usable ones; None is not given.  Raises UserError."""
+    if duration_s is not None and not 0.0 < duration_s < 1e9:  # False for NaN
+        raise UserError(f"--duration {duration_s:g} is no duration; give seconds > 0")
+    if sysid is not None and not 1 <= sysid <= 255:
+        raise UserError(f"--sysid {sysid} is no system id; give 1 to 255")
+    if seed is not None and seed < 0:
+        raise UserError(f"--seed {seed} is no seed; give a whole number >= 0")
+
+
 def open_links(texts: Sequence[str] | None, default: str, warn: Callable[[str], None]) -> list[Link]:
     """Open every link named, or the default.  Raises UserError; links opened before it are closed again."""
     links: list[Link] = []

@@ -40,16 +40,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fault", metavar="ID[=VALUE][@T]", default="crossed_lines", help="none flies a healthy flight")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("mavfdi-demo"))
     parser.add_argument("--policy", choices=[policy.value for policy in Policy], default=Policy.AUTO.value)
-    parser.add_argument("--duration", metavar="S", type=float, help="of the flight; default: as long as the fault needs")
+    arguments.add_duration(parser, "of the flight; default: as long as the fault needs")
     parser.add_argument("--no-view", action="store_true", help="print events instead of the live view")
     arguments.add_config(parser)
 
 
 def main(args: argparse.Namespace) -> int:
+    arguments.check_numbers(duration_s=args.duration, seed=args.seed)
     airframe = airframes.load(args.airframe, args.config)
-    airframe.load_simulator()
+    simulator = airframe.load_simulator()
     seed = args.seed if args.seed is not None else random.SystemRandom().randrange(1_000_000)
-    fault, onset_s = _fault(args.fault, seed)
+    fault, onset_s = _fault(args.fault, seed, simulator.VEHICLE.fault_ids)
     duration_s = args.duration or (HEALTHY_S if fault is None else onset_s + AFTER_S) + RELEASE_S
     clock = arguments.companion_clock(args.speedup)
     link = UdpListener(address.Address(address.Medium.UDP_LISTEN, "127.0.0.1", 0))
@@ -76,15 +77,25 @@ def main(args: argparse.Namespace) -> int:
     return 0
 
 
-def _fault(text: str, seed: int) -> tuple[str | None, float]:
-    """The fault's id with its value, and its onset after release, drawn with the seed where none is given."""
+def _fault(text: str, seed: int, known: tuple[str, ...]) -> tuple[str | None, float]:
+    """The fault's id with its value, and its onset after release, drawn with the seed where none is given.
+
+    Raises UserError for what the simulator would refuse: nothing has been started or written by then.
+    """
     if text == "none":
         return None, 0.0
+    from sitl.vehicle import check_faults, parse_fault
+
     body, at, onset = text.partition("@")
     try:
-        return body, float(onset) if at else float(random.Random(seed).randint(round(ONSET_S[0]), round(ONSET_S[1])))
+        onset_s = float(onset) if at else float(random.Random(seed).randint(round(ONSET_S[0]), round(ONSET_S[1])))
     except ValueError:
         raise UserError(f"--fault {text}: {onset!r} is no time in seconds") from None
+    try:
+        check_faults([parse_fault(f"{body}@{onset_s:g}")], known)
+    except ValueError as error:
+        raise UserError(f"--fault: {error}") from None
+    return body, onset_s
 
 
 @contextmanager

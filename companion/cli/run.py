@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", type=Path, default=Path("mavfdi-out"), help="folder for log, events, summary"
     )
     arguments.add_config(parser)
-    parser.add_argument("--duration", metavar="S", type=float, help="stop after so many seconds")
+    arguments.add_duration(parser, "stop after so many seconds")
     arguments.add_speedup(parser)
     parser.add_argument("--sysid", type=int, help="listen to this system only; default: the first autopilot heard")
     parser.add_argument("--compid", type=int, help=f"our component id; default {FIRST_COMPONENT}, moving on if it is taken")
@@ -38,6 +38,7 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(
             f"--compid {args.compid} is none for an onboard computer; give {FIRST_COMPONENT} to {LAST_COMPONENT}"
         )
+    arguments.check_numbers(duration_s=args.duration, sysid=args.sysid)
     airframe = airframes.load(args.airframe, args.config)
     clock = arguments.companion_clock(args.speedup)
     record = read_record(args.out)

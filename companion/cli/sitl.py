@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="inject a fault T seconds after release, for example crossed_lines@120 or motor:left/stuck=0.9@60",
     )
-    parser.add_argument("--duration", metavar="S", type=float, help="stop after so many simulated seconds")
+    arguments.add_duration(parser, "stop after so many simulated seconds")
     parser.add_argument("--rates", choices=["stock", "fast"], default="stock", help="stream rates; fast: 50 Hz")
     parser.add_argument("--arm", choices=["auto", "manual"], default="auto", help="release by itself, or when armed")
     parser.add_argument("--sysid", type=int, default=1)
@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    arguments.check_numbers(duration_s=args.duration, sysid=args.sysid, seed=args.seed)
     airframe = airframes.load(args.airframe, args.config)
     autopilot = build(airframe, args)
     from sitl.clock import Clock
