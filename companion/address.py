@@ -37,13 +37,14 @@ class Address:
     @property
     def canonical(self) -> str:
         if self.medium is Medium.SERIAL:
-            return f"serial:{self.device}:{self.baud}"
+            return f"{'serial_flowcontrol' if self.flow_control else 'serial'}:{self.device}:{self.baud}"
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{self.medium.value}:{host}:{self.port}"
 
 
 EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:127.0.0.1:14550, tcp:127.0.0.1:5760, /dev/ttyACM0,57600"
 DEFAULT_BAUD: Final = 57600  # of a device on USB, where it has no effect; a UART must say its own
+FASTEST_BAUD: Final = 100_000_000
 USB_DEVICE: Final = re.compile(r"/dev/(ttyACM|ttyUSB|serial/by-id/|serial/by-path/|cu\.usb|pts/)")
 ANY_HOST: Final = ("", "0.0.0.0", "::")
 
@@ -91,7 +92,7 @@ def parse(text: str) -> Address:
 def _network(medium: Medium, rest: str, text: str) -> Address:
     host, colon, port = rest.rpartition(":")
     host = host.strip("[]")
-    if not colon or not port.isdigit() or not 0 < int(port) <= 65535:
+    if not colon or not port.isdecimal() or not 0 < int(port) <= 65535:
         raise UserError(f"{text!r} has no port between 1 and 65535; for example {EXAMPLES}")
     listens = medium in (Medium.UDP_LISTEN, Medium.TCP_LISTEN)
     if not host and listens:
@@ -110,4 +111,6 @@ def _serial(rest: str, text: str, *, flow_control: bool = False) -> Address:
     device, baud = match["device"], match["baud"]
     if baud is None and not USB_DEVICE.match(device):
         raise UserError(f"{text!r} does not say its speed, and a UART needs one; for example {device},57600")
+    if baud is not None and not 0 < int(baud) <= FASTEST_BAUD:
+        raise UserError(f"{text!r} has no speed between 1 and {FASTEST_BAUD} baud; for example {device},57600")
     return Address(Medium.SERIAL, device=device, baud=int(baud or DEFAULT_BAUD), flow_control=flow_control)

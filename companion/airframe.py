@@ -9,6 +9,7 @@ import importlib.util
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import metadata, resources
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
@@ -114,8 +115,14 @@ def load(name: str, owners: Path | None = None) -> Airframe:
     parsed = configuration.convert(source, source.table, Configuration)
     _check_names(name, source, detector, parsed)
     monitor_config = configuration.convert(source, parsed.monitor, detector.config, "monitor.")
-    simulator = place.sitl if importlib.util.find_spec(place.sitl) else None
+    simulator = place.sitl if _exists(place.sitl) else None
     return Airframe(name, detector, parsed, monitor_config, source, simulator)
+
+
+def _exists(module: str) -> bool:
+    """Whether there is such a module, without importing the package around it: the live path loads no simulator."""
+    package = importlib.util.find_spec(module.rpartition(".")[0])
+    return package is not None and PathFinder.find_spec(module, package.submodule_search_locations) is not None
 
 
 def _check_names(name: str, source: Source, detector: Detector, parsed: Configuration) -> None:

@@ -63,7 +63,8 @@ class Aligner:
     _half_windows: list[int | None] = field(default_factory=lambda: [None, None])
     _half_began_us: int = 0
     _last_stamped_arrival_us: int = 0
-    _strange: int = 0  # how many messages in a row were off the clock
+    _strange: int = 0  # how many messages in a row were off the clock, and agreed with each other
+    _strange_offset_us: int = 0  # arrival - vehicle time of the last of them
     _stamps_us: list[int] = field(default_factory=list)
     _values: list[float] = field(default_factory=list)
 
@@ -115,9 +116,7 @@ class Aligner:
         if sampled.clock is ClockKind.BOOT_MS:
             if self.newest_us is None:
                 return sampled.stamp * 1000
-            turns, newest_ms = divmod(self.newest_us // 1000, WRAP_MS)
-            if newest_ms - sampled.stamp > WRAP_MS // 2:
-                turns += 1
+            turns = max(0, (self.newest_us // 1000 - sampled.stamp + WRAP_MS // 2) // WRAP_MS)  # the nearest
             return (turns * WRAP_MS + sampled.stamp) * 1000
         if self.newest_us is None:
             return None
@@ -137,7 +136,7 @@ class Aligner:
         silent_us = arrival_us - self._last_stamped_arrival_us
         ahead_us = t_us - self.newest_us
         if ahead_us < -REBOOT_BACK_US or ahead_us > max(silent_us, 0) + JUMP_AHEAD_US:
-            self._strange += trusted
+            self._strange = self._agreeing(arrival_us - t_us) if trusted else self._strange
             if not trusted or self._strange < BELIEVED_AFTER:
                 self.counts["off_clock"] += 1
                 return False
@@ -152,6 +151,12 @@ class Aligner:
             self.newest_us = t_us
             self._last_stamped_arrival_us = arrival_us
         return True
+
+    def _agreeing(self, offset_us: int) -> int:
+        """How many messages off the clock in a row tell one and the same other clock, this one included."""
+        agrees = abs(offset_us - self._strange_offset_us) <= REBOOT_BACK_US
+        self._strange_offset_us = offset_us
+        return self._strange + 1 if agrees else 1
 
     def _begin(self, t_us: int, arrival_us: int, reason: Restart) -> None:
         self.newest_us = t_us

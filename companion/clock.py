@@ -8,6 +8,7 @@ import time
 from typing import Final, Protocol
 
 STAMP_US: Final = 4
+REBOOT_BACK_US: Final = 1_000_000  # a vehicle's clock further back than this has been started anew
 
 
 class Clock(Protocol):
@@ -53,6 +54,9 @@ class VehicleClock:
         return (self._epoch_us + self._vehicle_us) // STAMP_US * STAMP_US
 
     def advance_to(self, vehicle_us: int) -> None:
+        if vehicle_us < self._vehicle_us - REBOOT_BACK_US:  # stamps go on where the vehicle's clock began anew
+            self._epoch_us += self._vehicle_us - vehicle_us
+            self._vehicle_us = vehicle_us
         self._vehicle_us = max(self._vehicle_us, vehicle_us)
 
     def wait_s(self, pause_s: float) -> float:

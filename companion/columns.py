@@ -277,7 +277,7 @@ def _bytes(path: Path) -> NDArray[np.uint8]:
             if not path.stat().st_size:
                 raise UserError(f"{path}: no MAVLink frame in 0 bytes; is it a telemetry log?")
             return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise UserError(f"{path}: cannot read the log: {error}") from None
 
 

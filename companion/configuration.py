@@ -125,13 +125,28 @@ def convert(source: Source, table: Table, record: type[Record], path: str = "") 
     try:
         return msgspec.convert(table, record)
     except msgspec.ValidationError as error:
-        what, _, where = str(error).partition(" - at `$")
-        inner = where.strip("`.")
-        key = ".".join(part for part in (path.rstrip("."), inner) if part)
-        origin = next((file for name, file in source.origins.items() if key and name.startswith(key)), None)
-        raise UserError(
-            f"{origin or ' + '.join(sorted(set(source.origins.values())))}: {key or 'configuration'}: {what}"
-        ) from None
+        key, what = _culprit(table, record, path.rstrip("."), str(error))
+        raise UserError(f"{_said_in(source, key)}: {key or 'configuration'}: {what}") from None
+
+
+def _culprit(table: Table, kind: Any, key: str, what: str) -> tuple[str, str]:
+    """(key, what is wrong with it) of the innermost value that will not convert; `what`: the same of the whole table."""
+    hints = get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+    for name, value in table.items():
+        inner = hints[name] if hints else get_args(kind)[1]
+        try:
+            msgspec.convert(value, inner)
+        except msgspec.ValidationError as error:
+            path = f"{key}.{name}" if key else name
+            inside = isinstance(value, dict) and (dataclasses.is_dataclass(inner) or get_origin(inner) is dict)
+            return _culprit(value if inside else {}, inner, path, str(error))
+    return key, what.partition(" - at `$")[0]
+
+
+def _said_in(source: Source, key: str) -> str:
+    """The files that have a say in this key or what is below it."""
+    files = {file for name, file in source.origins.items() if name == key or name.startswith(f"{key}.")}
+    return " + ".join(sorted(files or set(source.origins.values())))
 
 
 def _refuse_unknown(source: Source, table: object, kind: object, path: str) -> None:
@@ -142,8 +157,7 @@ def _refuse_unknown(source: Source, table: object, kind: object, path: str) -> N
         for key, value in table.items():
             if key not in hints:
                 known = ", ".join(sorted(hints))
-                where = next((file for name, file in source.origins.items() if name.startswith(path + key)), "configuration")
-                raise UserError(f"{where}: unknown key {path}{key}; known here: {known}")
+                raise UserError(f"{_said_in(source, path + key)}: unknown key {path}{key}; known here: {known}")
             _refuse_unknown(source, value, hints[key], f"{path}{key}.")
     elif get_origin(kind) is dict:
         for key, value in table.items():

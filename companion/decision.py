@@ -95,7 +95,7 @@ def decide(memory: Memory, finding: Finding, facts: Facts, rules: Rules) -> tupl
         return memory, Decision(Action.WARN, "no recovery is configured for it")
     if facts.policy is Policy.OFF:
         return memory, Decision(Action.WARN, "policy is off")
-    if finding.confidence < rules.least_confidence:
+    if not finding.confidence >= rules.least_confidence:  # a confidence of NaN is none
         return memory, Decision(Action.WARN, f"confidence below {rules.least_confidence:.0%}")
     if finding.fault_id in memory.tried:
         return memory, Decision(Action.WARN, "already tried once")

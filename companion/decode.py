@@ -181,6 +181,8 @@ def _pick(row: Row, message: Definition, channel: int) -> _Pick:
     base = row.field.partition("[")[0]
     unit = message.units.get(base, "")
     dimension = dimension_of(row.channel)
+    if unit not in WIRE_UNITS:
+        raise ValueError(f"{row.message}.{row.field} is in {unit}, for which there is no factor")
     wire_dimension, factor = WIRE_UNITS[unit]
     if unit and wire_dimension != dimension:
         raise ValueError(f"{row.message}.{row.field} is in {unit}, channel {row.channel} says {dimension}")

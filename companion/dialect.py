@@ -101,7 +101,7 @@ def encode(name: str, fields: Fields, *, sysid: int, compid: int, seq: int) -> b
     for field, kind, count in zip(message.fields, message.types, message.counts, strict=True):
         value = fields.get(field, "" if kind == "char" else (0,) * count if count else 0)
         if isinstance(value, str):
-            values.append(value.encode())
+            values.append(value.encode() or b"\0")  # a single character is never none
         elif isinstance(value, tuple):
             values.extend(value + (0,) * (count - len(value)))
         else:

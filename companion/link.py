@@ -8,6 +8,7 @@ import contextlib
 import errno
 import os
 import socket
+import termios
 from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import replace
@@ -23,6 +24,7 @@ CHUNK_BYTES: Final = 16_384
 READS: Final = 64  # of one link before the others get their turn
 PEERS: Final = 32  # of one listening link; the one silent for longest makes room
 REOPEN_US: Final = 1_000_000
+DEVICE_ERRORS: Final = (OSError, serial.SerialException, termios.error)  # what a device that goes away may raise
 BUFFER_BYTES: Final = 1 << 20  # kernel buffer: a stalled loop must not lose a burst at speed-up
 
 
@@ -63,7 +65,7 @@ def open_link(address: Address) -> Link:
                 return SerialPort(address)
     except socket.gaierror:
         raise UserError(f"{address.canonical}: host {address.host!r} is not known") from None
-    except (OSError, serial.SerialException) as error:
+    except (*DEVICE_ERRORS, ValueError) as error:  # ValueError: a speed that the device does not have
         raise UserError(f"{address.canonical}: {_reason(error)}") from None
 
 
@@ -75,7 +77,7 @@ def _reason(error: Exception) -> str:
         return "there is no such device; is it plugged in?"
     if code == errno.EACCES:
         return "no permission; on Linux a serial device needs the group dialout"
-    return str(error)
+    return " ".join(str(error).split())
 
 
 def _udp(address: Address) -> socket.socket:
@@ -326,7 +328,7 @@ class TcpListener:
         self._streams.clear()
 
     def _accept(self) -> None:
-        with contextlib.suppress(BlockingIOError):
+        with contextlib.suppress(OSError):  # nobody waits, or has gone again already
             while len(self._streams) < PEERS:
                 connection, peer = self._server.accept()
                 self._streams[peer] = _Stream(connection)
@@ -355,7 +357,7 @@ class SerialPort:
             return []
         try:
             data = self._port.read(CHUNK_BYTES)
-        except (OSError, serial.SerialException, TypeError):  # TypeError: pyserial, closed under its read
+        except (*DEVICE_ERRORS, TypeError):  # TypeError: pyserial, closed under its read
             self._drop()
             return []
         return [(self.name, data)] if data else []
@@ -367,14 +369,14 @@ class SerialPort:
         handle = self._port.fileno()
         try:  # not the port's own write: with a full buffer it tries again for ever
             self.counts["send_errors"] += not self._backlog.push(data, lambda waiting: os.write(handle, waiting))
-        except (OSError, serial.SerialException):
+        except DEVICE_ERRORS:
             self._drop()
 
     def maintain(self, now_us: int) -> None:
         if self._port is not None or now_us < self._next_us:
             return
         self._next_us = now_us + REOPEN_US
-        with contextlib.suppress(OSError, serial.SerialException):
+        with contextlib.suppress(*DEVICE_ERRORS):
             self._port = self._open()
             self.counts["reopened"] += 1
 
@@ -390,7 +392,7 @@ class SerialPort:
 
     def _drop(self) -> None:
         if self._port is not None:
-            with contextlib.suppress(OSError, serial.SerialException):
+            with contextlib.suppress(*DEVICE_ERRORS):
                 self._port.close()
             self._port = None
             self.counts["lost"] += 1

@@ -4,7 +4,7 @@ An SD card stalls for seconds; the loop must not.  The exception is the record o
 synced before its action is sent, by the loop itself.
 """
 
-import contextlib
+import errno
 import json
 import os
 import queue
@@ -33,7 +33,7 @@ class Recorder:
         self.failed = ""
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self.number = next(n for n in range(1, 1_000_000) if not self._path("flight", "tlog", n).exists())
+            self.number = next(n for n in range(1, 1_000_000) if not any(path.exists() for path in self._paths(n)))
             self._tlog = self._path("flight", "tlog", self.number).open("xb", buffering=0)
             self._events = self._path("events", "jsonl", self.number).open("xb", buffering=0)
         except OSError as error:
@@ -41,6 +41,12 @@ class Recorder:
         self._queue: queue.Queue[tuple[bool, bytes] | None] = queue.Queue(QUEUE)
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
+
+    def _paths(self, number: int) -> tuple[Path, ...]:
+        return tuple(
+            self._path(stem, ending, number)
+            for stem, ending in (("flight", "tlog"), ("events", "jsonl"), ("summary", "json"))
+        )
 
     @property
     def tlog_path(self) -> Path:
@@ -92,17 +98,22 @@ class Recorder:
                 self.dropped += 1
                 continue
             try:
-                (self._tlog if is_frame else self._events).write(data)
+                if (self._tlog if is_frame else self._events).write(data) != len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # a disk that fills up takes what still fits
             except OSError as error:
                 self.failed = error.strerror or str(error)
                 self.dropped += 1
 
 
 def load_record(folder: Path) -> str:
-    """The record that a killed run left in this folder; empty if there is none."""
-    with contextlib.suppress(FileNotFoundError):
-        return (folder / RECORD_NAME).read_text(encoding="utf-8")
-    return ""
+    """The record that a killed run left in this folder; empty if there is none.  Raises UserError if it cannot be read."""
+    path = folder / RECORD_NAME
+    try:
+        return path.read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot read it: {error}; check the vehicle's outputs, then remove it") from None
 
 
 def save_record(folder: Path, text: str) -> None:

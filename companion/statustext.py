@@ -13,14 +13,14 @@ CHUNK_BYTES: Final = 50
 PREFIX: Final = "mavfdi: "  # a ground station shows texts of every component alike: say who speaks
 BURST: Final = 5  # texts that may go out at once
 REFILL_US: Final = 1_000_000  # and one more each second
-QUEUE: Final = 20  # texts that wait; what comes on top is counted, not kept
+QUEUE: Final = 20  # texts that wait; what comes on top is counted, not kept, the least severe first
 
 
 def chunks(text: str, severity: Severity, text_id: int) -> list[Fields]:
     """STATUSTEXT fields for a text of any length (MAVLink 2 chunking); text_id is used only if one is not enough.
 
-    No character is cut in two.  A text whose last chunk would be exactly full is ended by an empty one, as the message's
-    definition asks.
+    No character is cut in two.  A NUL in a chunk ends the text, as the message's definition has it: so a chunk that a
+    longer character leaves short is filled with spaces, and a last one that is exactly full is followed by an empty one.
     """
     level = SEVERITY_MAVLINK[severity]
     whole = text.encode()
@@ -29,8 +29,9 @@ def chunks(text: str, severity: Severity, text_id: int) -> list[Fields]:
     pieces: list[str] = []
     while whole:
         cut = whole[:CHUNK_BYTES].decode("utf-8", "ignore")
-        pieces.append(cut)
-        whole = whole[len(cut.encode()) :]
+        taken = len(cut.encode())
+        whole = whole[taken:]
+        pieces.append(cut + " " * (CHUNK_BYTES - taken) if whole else cut)
     if len(pieces[-1].encode()) == CHUNK_BYTES:
         pieces.append("")
     return [{"severity": level, "text": piece, "id": text_id, "chunk_seq": place} for place, piece in enumerate(pieces)]
@@ -49,13 +50,13 @@ class Speaker:
 
     def say(self, text: str, severity: Severity, now_us: int) -> list[Fields]:
         """-> STATUSTEXT messages to send now; what has to wait comes out of `tick`, the most severe first."""
-        if len(self._waiting) >= QUEUE:
-            self.dropped += 1
-            return self.tick(now_us)
         self._order += 1
         self._waiting.append((SEVERITY_MAVLINK[severity], self._order, severity, PREFIX + text))
         self._waiting.sort()
-        return self.tick(now_us)
+        out = self.tick(now_us)
+        self.dropped += len(self._waiting[QUEUE:])
+        del self._waiting[QUEUE:]
+        return out
 
     def tick(self, now_us: int) -> list[Fields]:
         refill = (now_us - self._refilled_us) // REFILL_US

@@ -66,7 +66,10 @@ class Streams:
             return self._intervals({name: self.wanted_hz[name] for name in lacking}, looked_us)
         if self._round == 2:
             self._begin_count(looked_us)
-            groups = {GROUPS[name]: self.wanted_hz[name] for name in lacking if name in GROUPS}
+            groups: dict[int, float] = {}
+            for name in lacking:
+                if name in GROUPS:  # one rate for all of a group: that of the one in most haste
+                    groups[GROUPS[name]] = max(self.wanted_hz[name], groups.get(GROUPS[name], 1.0))
             return [
                 Send("REQUEST_DATA_STREAM", {"req_stream_id": group, "req_message_rate": round(rate_hz), "start_stop": 1})
                 for group, rate_hz in sorted(groups.items())

@@ -7,6 +7,7 @@ loses no good frame to damage: after a frame with a wrong CRC it looks for the n
 import gzip
 import hashlib
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -135,7 +136,7 @@ class Reader:
         try:
             data = self.path.read_bytes()
             return gzip.decompress(data) if self.path.suffix == ".gz" else data
-        except (OSError, EOFError) as error:
+        except (OSError, EOFError, zlib.error) as error:
             raise UserError(f"{self.path}: cannot read the log: {error}") from None
 
     def _next(self, data: bytes, position: int) -> tuple[Record | None, int]:

@@ -60,16 +60,18 @@ def main(args: argparse.Namespace) -> int:
     if fault is not None:
         fault_id, _, value = fault.partition("=")
         injected.append({"id": fault_id, "value": float(value) if value else None, "onset_t": RELEASE_S + onset_s})
-    with contextlib.closing(link), _show(core, args, f"{airframe.name}, seed {seed}") as shown:
+    with contextlib.closing(link):
+        recorder = Recorder(args.out)
+        with _show(core, args, f"{airframe.name}, seed {seed}") as shown:
 
-        def observe(effect: Effect) -> None:
-            history.note(effect)
-            shown(effect)
+            def observe(effect: Effect) -> None:
+                history.note(effect)
+                shown(effect)
 
-        live = Live(core, [link], clock, Recorder(args.out), Journal(airframe), observe)
-        arguments.on_stop_signal(lambda why: setattr(live, "stop", why))
-        with _simulator(args, link, seed, fault, onset_s, duration_s) as child:
-            content = _watch(live, child, {"seed": seed, "injected": injected})
+            live = Live(core, [link], clock, recorder, Journal(airframe), observe)
+            arguments.on_stop_signal(lambda why: setattr(live, "stop", why))
+            with _simulator(args, link, seed, fault, onset_s, duration_s) as child:
+                content = _watch(live, child, {"seed": seed, "injected": injected})
     picture = live.recorder.tlog_path.with_suffix(".png")
     onsets = [(str(args.fault).partition("@")[0], RELEASE_S + onset_s)] if fault is not None else []
     draw(picture, history, airframe.detector, live.journal.lines, onsets)

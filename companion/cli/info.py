@@ -43,7 +43,7 @@ def text(content: dict[str, Json]) -> str:
     lines = [
         f"{log['path']}: {log['bytes']} bytes",
         f"  frames    {reader['frames_v1']} MAVLink 1, {reader['frames_v2']} MAVLink 2, {reader['signed']} signed",
-        f"  damage    {reader['crc_failures']} CRC failures, {reader['resyncs']} resyncs over {reader['resync_bytes']} bytes,"
+        f"  damage    {reader['crc_failures']} CRC failures, {reader['resyncs']} resyncs ({reader['resync_bytes']} bytes),"
         f" tail {reader['tail_bytes']}, {reader['unknown_frames']} of unknown ids",
         f"  duration  {content['duration_s']} s",
     ]

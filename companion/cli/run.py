@@ -43,24 +43,26 @@ def main(args: argparse.Namespace) -> int:
     clock = arguments.companion_clock(args.speedup)
     record = read_record(args.out)
     links = arguments.open_links(args.connect, DEFAULT_LINK, lambda text: print(text, file=sys.stderr))
-    core = Core(
-        airframe,
-        Policy(args.policy),
-        pinned_sysid=args.sysid,
-        record=record,
-        compid=args.compid or FIRST_COMPONENT,
-        pinned_compid=args.compid is not None,
-    )
-    observe = None if args.quiet else show
-    live = Live(core, links, clock, Recorder(args.out), Journal(airframe), observe)
-
-    def stop(why: str) -> None:
-        live.stop = why
-
-    arguments.on_stop_signal(stop)
-    names = ", ".join(link.name for link in links)
-    print(f"mavfdi: {airframe.name} on {names}, policy {args.policy}, recording to {live.recorder.tlog_path}", flush=True)
     try:
+        core = Core(
+            airframe,
+            Policy(args.policy),
+            pinned_sysid=args.sysid,
+            record=record,
+            compid=args.compid or FIRST_COMPONENT,
+            pinned_compid=args.compid is not None,
+        )
+        observe = None if args.quiet else show
+        live = Live(core, links, clock, Recorder(args.out), Journal(airframe), observe)
+
+        def stop(why: str) -> None:
+            live.stop = why
+
+        arguments.on_stop_signal(stop)
+        names = ", ".join(link.name for link in links)
+        print(
+            f"mavfdi: {airframe.name} on {names}, policy {args.policy}, recording to {live.recorder.tlog_path}", flush=True
+        )
         content = live.run(args.duration)
     finally:
         for link in links:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import fdi.parafoil as parafoil
+from fdi.ekf import HEADING_RATE
 from fdi.verdict import NO_FAULT, Phase
 
 AT = {name: index for index, name in enumerate(parafoil.CHANNELS)}
@@ -299,10 +300,11 @@ def test_functions_as_they_were_change_nothing_and_swapped_ones_start_the_turns_
     assert all(np.array_equal(array, before[name], equal_nan=True) for name, array in monitor.state.items())
     monitor.told(0, SWAPPED)
     assert np.array_equal(monitor.air[:, 0], before["air"][0])
-    assert not monitor.observers.any()
+    seen_rad_s = np.einsum("k,khf->hf", np.array(config.lateral_model.output), monitor.observers)
+    assert seen_rad_s == pytest.approx(np.full((4, 1), monitor.air[HEADING_RATE, 0]), abs=1e-12)
     assert not monitor.heading_rate.mean().any()
     verdict = monitor.step(values[-1], age_s[-1])
-    assert verdict.phase[0] == Phase.HEALTHY
+    assert verdict.phase[0] == Phase.WARMING
     assert named(verdict) is None
 
 
@@ -313,7 +315,9 @@ def test_crossed_lines_are_mended_by_the_swap_and_stay_judged(config, fly, scena
     assert named(verdicts[-1]) == "crossed_lines"
     monitor.told(0, SWAPPED)
     rest, _ = judge(config, values[700:], age_s[700:], monitor=monitor)
-    assert set(phases(rest)) == {Phase.HEALTHY}
+    warming = round(config.warm_up_s / config.period_s)
+    assert set(phases(rest[:warming])) == {Phase.WARMING}
+    assert set(phases(rest[warming:])) == {Phase.HEALTHY}
     assert max(verdict.residuals[0, 0] for verdict in rest[300:]) < 0.01
 
 
