@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from companion import configuration
+from companion.checks import CHECKS
 from companion.configuration import Configuration, Source
 from companion.decode import Decoder
 from companion.errors import UserError
@@ -135,6 +136,8 @@ def _check_names(name: str, source: Source, detector: Detector, parsed: Configur
         )
     if strange := set(parsed.grid.maximal_ages_s) - set(detector.channels):
         raise UserError(f"{files}: grid.maximal_ages_s.{sorted(strange)[0]} is no channel of {name}")
+    if unknown := set(parsed.checks.skip) - {check.id for check in CHECKS}:
+        raise UserError(f"{files}: checks.skip: there is no check {sorted(unknown)[0]!r}; docs/checks.md lists them")
     faults = {fault.id for fault in detector.faults} | {fault.fault_class for fault in detector.faults}
     for fault_id, plan in parsed.recovery.items():
         if fault_id not in faults:

@@ -12,11 +12,11 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from companion import airframe as airframes
 from companion.airframe import Airframe
+from companion.checks import Bench, Finding, Status, worst
 from companion.core import FIRST_COMPONENT, LAST_COMPONENT, POLICIES, Core
 from companion.decision import Policy
 from companion.dialect import encode
 from companion.effects import Effect, Send
-from companion.errors import UserError
 from companion.events import SCHEMA, Json
 from companion.frames import Frame, Splitter
 from companion.journal import Journal
@@ -83,44 +83,69 @@ def _content(frame: Frame) -> bytes:
 class Analysis:
     """The outcome of one log."""
 
-    replay: Replay
     content: dict[str, Json]  # the JSON object of ARCHITECTURE.md, "Analysis"
+    replay: Replay | None  # None where no airframe is configured for the vehicle: then the checks alone judge
+    findings: tuple[Finding, ...]
 
     @property
-    def faults(self) -> list[dict[str, Json]]:
-        return self.replay.journal.faults
+    def verdict(self) -> str:
+        return str(self.content["verdict"])
+
+    @property
+    def faulty(self) -> bool:
+        """Was a fault found, by the airframe's monitor or by a check?"""
+        return self.verdict == "fault"
 
 
 def analyze(
     path: Path,
-    choose: Callable[[list[Heartbeat]], Airframe],
+    choose: Callable[[list[Heartbeat]], Airframe | None],
     policy: Policy | None = None,
     progress: Callable[[int], None] | None = None,
+    observe: Callable[[Effect], None] | None = None,
 ) -> Analysis:
     """Read a log and say what happened.
 
-    choose: from the heartbeats of the vehicles in the log to the airframe; progress: told the number of frames read.
-    Raises UserError for a log that cannot be read.
+    choose: from the heartbeats of the vehicles in the log to the airframe, None for none; progress: told the number of
+    frames read; observe: shown every effect of the replay.  Raises UserError for a log that cannot be read.
     """
     records, report = _open(path, progress)
     vehicles = _vehicles(records)
-    replay = Replay(choose(vehicles), policy)
+    airframe = choose(vehicles)
+    replay = Replay(airframe, policy, observe=observe) if airframe is not None else None
+    bench = Bench()
     for record in records:
-        replay.take(record)
+        plausible = record.stamp_us is not None and record.stamp_us in PLAUSIBLE_US
+        bench.take(record.frame, record.stamp_us if plausible else None)
+        if replay is not None:
+            replay.take(record)
+    skipped = airframe.configuration.checks.skip if airframe is not None else ()
+    findings = tuple(finding for finding in bench.finish() if finding.id not in skipped)
+    name, sysid = (replay.airframe.name, replay.core.watch.sysid) if replay is not None else (None, None)
+    journal = replay.journal if replay is not None else None
     content: dict[str, Json] = {
-        **_facts(path, report, vehicles, replay.airframe.name, replay.core.watch.sysid),
-        "verdict": replay.journal.verdict,
-        "faults": list(replay.journal.faults),
-        "checks": [],
-        "events": list(replay.journal.lines),
+        **_facts(path, report, vehicles, name, sysid),
+        "verdict": _verdict(journal.verdict if journal is not None else "not_judged", worst(list(findings))),
+        "faults": list(journal.faults) if journal is not None else [],
+        "checks": [finding.as_json() for finding in findings],
+        "events": list(journal.lines) if journal is not None else [],
     }
-    if replay.recorded:
+    if replay is not None and replay.recorded:
         content["replay"] = {
             "sends": len(replay.sent),
             "sends_recorded": len(replay.recorded),
             "same_sends": replay.sent == replay.recorded,
         }
-    return Analysis(replay, content)
+    return Analysis(content, replay, findings)
+
+
+def _verdict(monitor: str, checks: Status) -> str:
+    """The graver of what the airframe's monitor and the checks say."""
+    if monitor == "fault" or checks is Status.FAULT:
+        return "fault"
+    if monitor == "degraded" or checks is Status.WARNING:
+        return "degraded"
+    return "healthy" if monitor == "healthy" or checks is Status.OK else "not_judged"
 
 
 def facts(path: Path) -> dict[str, Json]:
@@ -183,12 +208,11 @@ def _counted(records: Iterable[Record], progress: Callable[[int], None] | None) 
         yield record
 
 
-def by_type(beats: list[Heartbeat], owners: Path | None = None) -> Airframe:
-    """The configured airframe that names the type of one of these vehicles.  Raises UserError if none does."""
+def by_type(beats: list[Heartbeat], owners: Path | None = None) -> Airframe | None:
+    """The configured airframe that names the type of one of these vehicles; None if none does."""
     found = {name: airframes.load(name, owners) for name in airframes.places()}
     for beat in beats:
         for airframe in found.values():
             if beat.type in airframe.configuration.vehicle.mav_types:
                 return airframe
-    types = ", ".join(str(beat.type) for beat in beats) or "none heard"
-    raise UserError(f"no airframe is configured for MAV_TYPE {types}; name one with --airframe: {', '.join(found)}")
+    return None

@@ -53,10 +53,18 @@ class VehicleTable:
 
 
 @dataclass(frozen=True, slots=True)
+class ChecksTable:
+    """`[checks]`: which of the general checks do not fit this airframe."""
+
+    skip: tuple[str, ...]  # by id (docs/checks.md)
+
+
+@dataclass(frozen=True, slots=True)
 class Configuration:
     """Everything that the companion reads; the airframe's own tables are still unread TOML."""
 
     vehicle: VehicleTable
+    checks: ChecksTable
     grid: Grid
     streams: dict[str, float]  # message -> Hz
     decision: Rules

@@ -68,12 +68,12 @@ def write(path: Path, analysis: Analysis, history: History) -> None:
         from plotly.offline import get_plotlyjs
     except ModuleNotFoundError:
         raise UserError("the report needs plotly; install it with: pip install 'mavfdi[report]'") from None
-    figures = [
-        _figure(graphs, "Timeline", _timeline(graphs, analysis), height=320),
-        _figure(graphs, "Residuals as a share of their thresholds", _residuals(graphs, analysis, history), log=True),
-        _figure(graphs, "Asked for and flown", _signals(graphs, analysis, history)),
-        _figure(graphs, "Messages of the log", _messages(graphs, analysis), height=420, clock=False),
-    ]
+    figures = [_figure(graphs, "Timeline", _timeline(graphs, analysis), height=320)]
+    if analysis.replay is not None:
+        residuals = _residuals(graphs, analysis, history)
+        figures.append(_figure(graphs, "Residuals as a share of their thresholds", residuals, log=True))
+        figures.append(_figure(graphs, "Asked for and flown", _signals(graphs, analysis, history)))
+    figures.append(_figure(graphs, "Messages of the log", _messages(graphs, analysis), height=420, clock=False))
     parts = [figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True}) for figure in figures]
     page = (
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
@@ -105,7 +105,7 @@ def _summary(analysis: Analysis) -> str:
     duration = content["duration_s"]
     reader = content["reader"] if isinstance(content["reader"], dict) else {}
     facts = [
-        ("airframe", analysis.replay.airframe.name),
+        ("airframe", analysis.replay.airframe.name if analysis.replay is not None else "none configured"),
         ("duration", f"{duration:.1f} s" if isinstance(duration, float) else "unknown"),
         ("frames", f"{reader['frames_v1']} MAVLink 1, {reader['frames_v2']} MAVLink 2, {reader['signed']} signed"),
         ("damage", f"{reader['crc_failures']} CRC failures, {reader['resyncs']} resyncs, tail {reader['tail_bytes']} bytes"),
@@ -212,7 +212,7 @@ def _lines(graphs: Any, curves: Sequence[Curve]) -> list[Any]:
 
 
 def _residuals(graphs: Any, analysis: Analysis, history: History) -> list[Any]:
-    if not history.t_s:
+    if not history.t_s or analysis.replay is None:
         return []
     t_s, shares = np.array(history.t_s), np.array(history.residuals) / history.thresholds
     names = analysis.replay.airframe.detector.residuals
@@ -220,7 +220,7 @@ def _residuals(graphs: Any, analysis: Analysis, history: History) -> list[Any]:
 
 
 def _signals(graphs: Any, analysis: Analysis, history: History) -> list[Any]:
-    if not history.t_s:
+    if not history.t_s or analysis.replay is None:
         return []
     t_s, signals = np.array(history.t_s), np.array(history.signals)
     names = analysis.replay.airframe.detector.signals
