@@ -7,6 +7,7 @@ reads frame by frame comes out here the same, faster by two orders of magnitude.
 import gzip
 import hashlib
 import mmap
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass

@@ -18,6 +18,7 @@ from sitl.clock import Clock
 from sitl.server import serve
 from tests.sitl.network import parafoil_autopilot, sled_autopilot
 from tests.sitl.test_server import UdpPeer, free_port, kind
+from tests.system.flights import CROSSED, flying, watching
 
 LIMIT_S = 40.0
 MAVPROXY = Path(sys.executable).parent / "mavproxy.py"
@@ -106,3 +107,17 @@ def test_mavproxy_shows_the_words_of_a_companion_and_reads_the_vehicles_paramete
             link.close()
     assert any(client[0].startswith("udpout") for client in autopilot.clients)
     assert "SERVO1_FUNCTION" in (tmp_path / "mav.parm").read_text(encoding="utf-8")
+
+
+def test_mavproxy_shows_what_a_live_companion_finds_and_does(mavproxy, tmp_path):
+    port = free_port()
+    with (
+        watching(tmp_path / "out", f"udpin:127.0.0.1:{port}", speedup="10") as run,
+        flying(
+            f"udpout:127.0.0.1:{port}", f"udpout:127.0.0.1:{mavproxy.port}", fault=CROSSED, speedup="10", duration_s=600.0
+        ),
+    ):  # fmt: skip
+        mavproxy.wait_for("mavfdi: control lines crossed (99.9 %)")
+        mavproxy.wait_for("mavfdi: swapping control lines")
+        mavproxy.wait_for("mavfdi: repair verified")
+        assert run.stop() == 0, run.text
