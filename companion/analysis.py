@@ -125,7 +125,7 @@ def analyze(
     journal = replay.journal if replay is not None else None
     content: dict[str, Json] = {
         **_facts(path, report, vehicles, name, sysid),
-        "verdict": _verdict(journal.verdict if journal is not None else "not_judged", worst(list(findings))),
+        "verdict": _verdict(journal.verdict if journal is not None else None, worst(list(findings))),
         "faults": list(journal.faults) if journal is not None else [],
         "checks": [finding.as_json() for finding in findings],
         "events": list(journal.lines) if journal is not None else [],
@@ -139,13 +139,18 @@ def analyze(
     return Analysis(content, replay, findings)
 
 
-def _verdict(monitor: str, checks: Status) -> str:
-    """The graver of what the airframe's monitor and the checks say."""
+def _verdict(monitor: str | None, checks: Status) -> str:
+    """The graver of what the airframe's monitor (None: there is none) and the checks say.
+
+    Where there is a monitor that judged nothing, checks that found nothing do not make the vehicle healthy.
+    """
     if monitor == "fault" or checks is Status.FAULT:
         return "fault"
     if monitor == "degraded" or checks is Status.WARNING:
         return "degraded"
-    return "healthy" if monitor == "healthy" or checks is Status.OK else "not_judged"
+    if monitor is not None:
+        return monitor
+    return "healthy" if checks is Status.OK else "not_judged"
 
 
 def facts(path: Path) -> dict[str, Json]:

@@ -55,7 +55,7 @@ STAGE_SPOKEN: Final[Mapping[Stage, str]] = {
     Stage.VERIFYING: "changed, watching whether it helps",
     Stage.UNDOING: "putting the parameters back",
     Stage.DONE: "repair verified",
-    Stage.REFUSED: "repair refused, nothing changed",
+    Stage.REFUSED: "repair refused, parameters as before",
     Stage.ROLLED_BACK: "repair undone, parameters as before",
     Stage.UNCERTAIN: "PARAMETERS UNCERTAIN: CHECK OUTPUTS",
 }
@@ -443,7 +443,8 @@ class Core:
         """Take over the recovery's new state, say what changed, do what it asks."""
         self.recovery, effects = output
         after = self.recovery
-        if after.stage is not before.stage and after.stage in STAGE_EVENTS:
+        again = before.stage is Stage.UNDO_CHECKING and after.stage is Stage.UNDOING  # another round of the same
+        if after.stage is not before.stage and after.stage in STAGE_EVENTS and not again:
             assert self.plan is not None  # there is no recovery without its plan
             name, severity = STAGE_EVENTS[after.stage]
             if name == "failed" and "veto" in after.reason:

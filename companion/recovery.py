@@ -80,7 +80,7 @@ class Stage(StrEnum):
     UNDOING = "undoing"
     UNDO_CHECKING = "undo_checking"
     DONE = "done"
-    REFUSED = "refused"  # nothing was changed
+    REFUSED = "refused"  # the vehicle carries what it carried, and was never seen to carry anything else
     ROLLED_BACK = "rolled_back"
     UNCERTAIN = "uncertain"  # the parameters may be half changed: the operator must look
 
@@ -93,7 +93,7 @@ STAGE_WORDS: Final = {  # for people
     Stage.UNDOING: "putting the parameters back",
     Stage.UNDO_CHECKING: "checking that they are back",
     Stage.DONE: "changed and verified",
-    Stage.REFUSED: "nothing changed",
+    Stage.REFUSED: "refused, as before",
     Stage.ROLLED_BACK: "put back as before",
     Stage.UNCERTAIN: "parameters uncertain",
 }
@@ -338,8 +338,11 @@ def _reading_over(recovery: Recovery, plan: Plan, now_us: int) -> Output:
         return _end(replace(recovery, reason=f"{' and '.join(plan.parameters)} hold nothing to swap"), Stage.REFUSED)
     for one, other in plan.must_agree:
         left, right = answers[one], answers[other]
-        both_silent = left is None and right is None  # this autopilot has no such parameters
-        if not both_silent and (left is None or right is None or not same_value(left, right)):
+        if left is None and right is None:
+            continue  # this autopilot has no such parameters
+        if left is None or right is None:
+            return _end(replace(recovery, reason=f"{one if left is None else other} does not answer"), Stage.REFUSED)
+        if not same_value(left, right):
             return _end(replace(recovery, reason=f"{one} and {other} differ"), Stage.REFUSED)
     return _set(replace(recovery, original=tuple(original), tries=0), plan, 0, now_us)
 

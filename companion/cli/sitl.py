@@ -2,6 +2,8 @@
 
 import argparse
 import sys
+import time
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from companion import airframe as airframes
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from sitl.autopilot import Autopilot
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
+COMPILE_S = 1.0  # of flight in which everything that is compiled has been called
 SETTLED_S = 10.0  # after touchdown, before the simulator ends by itself
 
 
@@ -81,8 +84,20 @@ def build(airframe: Airframe, args: argparse.Namespace) -> "Autopilot":
         check_faults(faults, simulator.VEHICLE.fault_ids)
         if len(faults) > 1:
             raise UserError("one fault a flight; a second one can be set in flight by the SIM_FLT_ parameters")
+        compile_kernels(simulator, config, args.seed)
         fleet = simulator.Fleet(config, [args.seed], faults or None)
     except ValueError as error:
         raise UserError(f"--fault: {error}") from None
     release_s = 5.0 if args.arm == "auto" else None
     return Autopilot(simulator.VEHICLE, fleet, sysid=args.sysid, rates=args.rates, release_s=release_s, seed=args.seed)
+
+
+def compile_kernels(simulator: ModuleType, config: object, seed: int) -> None:
+    """Fly a moment of a throw-away flight: compiling takes seconds on the first run, in which no vehicle may stand still."""
+    began_s = time.monotonic()
+    for step_s in simulator.VEHICLE.steps_s:
+        fleet = simulator.Fleet(config, [seed], None)
+        for _ in range(round(COMPILE_S / step_s)):
+            fleet.step(step_s)
+    if time.monotonic() - began_s > COMPILE_S:
+        print("mavfdi sitl: compiled the plant, once for this installation", flush=True)

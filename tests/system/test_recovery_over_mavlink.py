@@ -19,7 +19,7 @@ LEFT, RIGHT = OUTPUTS
 HALF = (78.0, 78.0)
 SAID = {  # last of the texts about the repair
     Stage.DONE: "repair verified",
-    Stage.REFUSED: "repair refused, nothing changed",
+    Stage.REFUSED: "repair refused, parameters as before",
     Stage.ROLLED_BACK: "repair undone, parameters as before",
     Stage.UNCERTAIN: "PARAMETERS UNCERTAIN: CHECK OUTPUTS",
 }
