@@ -307,6 +307,7 @@ def test_pairs_that_differ_or_answer_by_half_refuse_the_swap():
     by_half = Run(CAREFUL).read().hears(MIN_LEFT, 1000.0).waits(1.0).waits(1.0)
     for run, reason in ((differ, f"{MIN_LEFT} and {MIN_RIGHT} differ"), (by_half, f"{MIN_RIGHT} does not answer")):
         assert run.stage is Stage.REFUSED
+        assert run.sets == []
         assert reason == run.state.reason
 
 
