@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from companion import walk
 from companion.decode import WIRE_UNITS
-from companion.dialect import Definition, by_name, definition, known_ids
+from companion.dialect import Definition, by_name, definition, known_ids, recognised
 from companion.errors import UserError
 from companion.frames import Frame
 from companion.tlog import PLAUSIBLE_US, Record, Report, Source
@@ -297,6 +297,11 @@ def _fill_report(index: Index) -> None:
         report.messages[found.name] = int(counts[message_id])
     for message_id, count in zip(*np.unique(index.ids[~known], return_counts=True), strict=True):
         report.messages[f"UNKNOWN_{message_id}"] = int(count)
+    for number in np.flatnonzero(~known).tolist():
+        start = int(index.starts[number])
+        raw = index.data[start : start + int(index.sizes[number])].tobytes()
+        if (name := recognised(raw, int(index.ids[number]))) is not None:
+            report.recognised[name] += 1
     report.sources = _sources(index.sources[known], index.seqs[known])
     stamped = index.stamps_us[(flags & walk.UNSTAMPED) == 0]
     plausible = stamped[(stamped >= PLAUSIBLE_US.start) & (stamped < PLAUSIBLE_US.stop)].astype(np.int64)

@@ -76,6 +76,39 @@ def definition(message_id: int) -> Definition | None:
     )
 
 
+# Messages of MAVLink's common.xml (2026) that pymavlink's `all` dialect lacks, as PX4 sends them: id -> (name, CRC_EXTRA).
+# Enough to check a frame and to say what it is; their fields are not read.
+ELSEWHERE: Final[Mapping[int, tuple[str, int]]] = MappingProxyType(
+    {
+        80: ("COMMAND_CANCEL", 14),
+        290: ("ESC_INFO", 251),
+        291: ("ESC_STATUS", 10),
+        300: ("PROTOCOL_VERSION", 217),
+        371: ("FUEL_STATUS", 10),
+        372: ("BATTERY_INFO", 26),
+        380: ("TIME_ESTIMATE_TO_TARGET", 232),
+        395: ("COMPONENT_INFORMATION", 0),
+        396: ("COMPONENT_INFORMATION_BASIC", 50),
+        397: ("COMPONENT_METADATA", 182),
+        410: ("EVENT", 160),
+        411: ("CURRENT_EVENT_SEQUENCE", 106),
+        412: ("REQUEST_EVENT", 33),
+        413: ("RESPONSE_EVENT_ERROR", 77),
+    }
+)
+
+
+def recognised(raw: bytes, message_id: int) -> str | None:
+    """The name of a frame that the dialect does not know, if its CRC fits a definition of ELSEWHERE."""
+    found = ELSEWHERE.get(message_id)
+    if found is None:
+        return None
+    name, extra = found
+    end = HEADER_BYTES[raw[0]] + raw[1]
+    fits = mcrf4xx(raw[1:end] + bytes((extra,))) == raw[end] | raw[end + 1] << 8
+    return name if fits else None
+
+
 def known_ids() -> dict[int, int]:
     """CRC_EXTRA of every message id of the dialect."""
     return {message_id: message.crc_extra for message_id, message in messages.mavlink_map.items()}

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from companion.dialect import MAGIC_V1
+from companion.dialect import MAGIC_V1, recognised
 from companion.errors import UserError
 from companion.events import Json
 from companion.frames import Check, Frame, IncompleteError, candidate
@@ -57,6 +57,7 @@ class Report:
     resync_bytes: int = 0
     tail_bytes: int = 0
     unknown_frames: int = 0
+    recognised: Counter[str] = field(default_factory=Counter)  # of the unknown ones, by `dialect.recognised`
     messages: Counter[str] = field(default_factory=Counter)
     stamps_backward: int = 0
     stamps_implausible: int = 0
@@ -79,6 +80,7 @@ class Report:
             "resync_bytes": self.resync_bytes,
             "tail_bytes": self.tail_bytes,
             "unknown_frames": self.unknown_frames,
+            "recognised": dict(sorted(self.recognised.items())),
             "messages": dict(sorted(self.messages.items())),
             "sources": [
                 {"sysid": sysid, "compid": compid, "frames": source.frames, "seq_lost": source.seq_lost}
@@ -179,6 +181,8 @@ class Reader:
         report.messages[frame.name] += 1
         if frame.definition is None:
             report.unknown_frames += 1
+            if (name := recognised(frame.raw, frame.message_id)) is not None:
+                report.recognised[name] += 1
             return
         source = report.sources.setdefault((frame.sysid, frame.compid), Source())
         source.frames += 1

@@ -189,3 +189,21 @@ def test_what_is_no_log_is_told_in_one_line(tmp_path):
         with pytest.raises(UserError, match=name) as told:
             columns.read(tmp_path / name)
         assert "\n" not in str(told.value)
+
+
+def test_a_message_of_a_newer_definition_is_named_where_its_crc_fits_and_stays_unknown(tmp_path):
+    from fastcrc.crc16 import mcrf4xx
+
+    def esc_status(extra):
+        head = bytes((57, 0, 0, 1, 1, 1)) + (291).to_bytes(3, "little")
+        crc = mcrf4xx(head + bytes(57) + bytes((extra,)))
+        return b"\xfd" + head + bytes(57) + crc.to_bytes(2, "little")
+
+    known = encode("ATTITUDE", {}, sysid=1, compid=1, seq=0)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(as_log([known, esc_status(10), known, esc_status(11), known]))
+    both(path)
+    report = columns.read(path).report
+    assert report.unknown_frames == 2
+    assert dict(report.recognised) == {"ESC_STATUS": 1}
+    assert report.messages["UNKNOWN_291"] == 2
