@@ -88,6 +88,21 @@ def _udp(address: Address) -> socket.socket:
     return made
 
 
+def _datagrams(made: socket.socket, counts: Counter[str]) -> list[tuple[Hashable, bytes]]:
+    """What has arrived, a bounded number; errors are answers of the network to something sent to a peer that is gone."""
+    out: list[tuple[Hashable, bytes]] = []
+    for _ in range(READS):
+        try:
+            data, peer = made.recvfrom(DATAGRAM_BYTES)
+        except BlockingIOError:
+            break
+        except OSError:
+            counts["receive_errors"] += 1
+            continue
+        out.append((peer, data))
+    return out
+
+
 class UdpListener:
     """Bound to a port; learns its peers as they speak."""
 
@@ -108,20 +123,12 @@ class UdpListener:
         return [self._socket.fileno()]
 
     def receive(self) -> list[tuple[Hashable, bytes]]:
-        out: list[tuple[Hashable, bytes]] = []
-        for _ in range(READS):
-            try:
-                data, peer = self._socket.recvfrom(DATAGRAM_BYTES)
-            except BlockingIOError:
-                break
-            except OSError:  # the ICMP answer to something we sent to a peer that is gone
-                self.counts["receive_errors"] += 1
-                continue
+        out = _datagrams(self._socket, self.counts)
+        for peer, _ in out:
             self._peers.pop(peer, None)
             self._peers[peer] = None
             if len(self._peers) > PEERS:
                 del self._peers[next(iter(self._peers))]
-            out.append((peer, data))
         return out
 
     def send(self, data: bytes, peer: Hashable | None = None) -> None:
@@ -154,18 +161,9 @@ class UdpSender:
         return [self._socket.fileno()]
 
     def receive(self) -> list[tuple[Hashable, bytes]]:
-        out: list[tuple[Hashable, bytes]] = []
-        for _ in range(READS):
-            try:
-                data, peer = self._socket.recvfrom(DATAGRAM_BYTES)
-            except BlockingIOError:
-                break
-            except OSError:  # "connection refused": nobody listens there yet
-                self.counts["receive_errors"] += 1
-                continue
-            if self._broadcasts:
-                self._target, self._broadcasts = peer, False
-            out.append((peer, data))
+        out = _datagrams(self._socket, self.counts)
+        if out and self._broadcasts:
+            self._target, self._broadcasts = out[0][0], False
         return out
 
     def send(self, data: bytes, peer: Hashable | None = None) -> None:
