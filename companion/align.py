@@ -98,7 +98,10 @@ class Aligner:
         rows: list[GridRow] = []
         if self.newest_us is None or self.offset_us is None:
             return rows
-        last_us = min(arrival_us - self.offset_us - self.period_us - 1, self.newest_us + PAUSE_AFTER_US)
+        last_us = arrival_us - self.offset_us - self.period_us - 1
+        if last_us < self._next_us:
+            return rows  # asked at every frame, and nearly always so
+        last_us = min(last_us, self.newest_us + PAUSE_AFTER_US)
         while self._next_us <= last_us:
             rows.append(self._close())
         return rows

@@ -23,6 +23,9 @@ class Clock(Protocol):
     def wait_s(self, pause_s: float) -> float:
         """How long to wait for bytes if nothing is to be done for pause_s of the vehicle's time."""
 
+    def arrival_us(self, looked_us: int, pause_s: float) -> int:
+        """The stamp of bytes found now by a loop that has last looked at looked_us and looks every pause_s."""
+
 
 class WallClock:
     """Real time, or a multiple of it beside a simulator that flies faster."""
@@ -41,6 +44,10 @@ class WallClock:
 
     def wait_s(self, pause_s: float) -> float:
         return pause_s / self._speedup
+
+    def arrival_us(self, looked_us: int, pause_s: float) -> int:
+        """Now, unless the loop was held up: the bytes then wait since soon after it looked, and are not late."""
+        return min(self.now_us(), (looked_us + round(pause_s * 1e6)) // STAMP_US * STAMP_US)
 
 
 class VehicleClock:
@@ -61,3 +68,6 @@ class VehicleClock:
 
     def wait_s(self, pause_s: float) -> float:
         return pause_s
+
+    def arrival_us(self, looked_us: int, pause_s: float) -> int:
+        return self.now_us()

@@ -215,6 +215,11 @@ def row_dtype(message: Definition) -> np.dtype[np.void]:
     )
 
 
+def is_compiled() -> bool:
+    """Has an earlier start left the compiled walk on disk?  Else the first log takes seconds longer."""
+    return any(Path(walk.walk.stats.cache_path).glob("walk.walk-*.nbi"))
+
+
 def read(path: Path) -> Index:
     """Index a log, `.tlog` or `.tlog.gz`.  Raises UserError for a file that cannot be read or holds no frame."""
     data = _bytes(path)

@@ -124,7 +124,8 @@ class Core:
         if frame.definition is None:
             self.counts["unknown"] += 1
             return out
-        if frame.name == "HEARTBEAT":
+        name = frame.definition.name
+        if name == "HEARTBEAT":
             self._heartbeat(heartbeat(frame), out)
         if frame.sysid == self.sysid and frame.compid == self.compid:
             return out
@@ -134,7 +135,7 @@ class Core:
             self._request(frame, out)
             return out
         self.counts["messages"] += 1
-        self._streams.heard(frame.name)
+        self._streams.heard(name)
         self.watch.heard_us = arrival_us
         if self.watch.link in (LinkState.SILENT, LinkState.LOST):
             self.watch.link = LinkState.UP
@@ -144,7 +145,7 @@ class Core:
         if sampled is not None:
             for row in self.aligner.push(sampled, arrival_us):
                 self._row(row, out)
-        match frame.name:
+        match name:
             case "PARAM_VALUE":
                 self._parameter(frame.fields(), out)
             case "PARAM_ERROR":
@@ -174,15 +175,21 @@ class Core:
             self._tell(out, Event(Kind.SELF, "config", Severity.ERROR, text), "several vehicles: give --sysid")
         if self.watch.known:
             out += self._ask_parameters(arrival_us)
-            out += [self._to_vehicle(send) for send in self._streams.tick(arrival_us)]
+            for send in self._streams.tick(arrival_us):
+                out.append(self._to_vehicle(send))
             if self._streams.missing != self._missing_told:
                 self._missing_told = self._streams.missing
                 self._lacking(out)
         if arrival_us >= self._next_beat_us:
             self._next_beat_us = arrival_us + BEAT_US
             out.append(self._beat(arrival_us))
-        self._speak(out, self._speaker.tick(arrival_us))
+        if texts := self._speaker.tick(arrival_us):
+            self._speak(out, texts)
         return out
+
+    def farewell(self, arrival_us: int) -> list[Effect]:
+        """The run ends: one last heartbeat, which also tells the replay of the log up to when we have listened."""
+        return [*self.tick(arrival_us), self._heartbeat_of_ours(mavlink.MAV_STATE_POWEROFF)]
 
     # -- the vehicle ------------------------------------------------------------------------------------------------
 
@@ -260,9 +267,11 @@ class Core:
             self._tell(out, event, f"no {name} stream", at_us=self._streams.until_us)
 
     def _ask_parameters(self, arrival_us: int) -> list[Effect]:
-        missing = [name for name in self.airframe.detector.parameters if name not in self.parameters]
-        if not missing or arrival_us < self._parameters_due_us or self._parameter_tries >= PARAMETER_TRIES:
+        if arrival_us < self._parameters_due_us or self._parameter_tries >= PARAMETER_TRIES:
             return []
+        if len(self.parameters) == len(self.airframe.detector.parameters):
+            return []  # none but these are kept
+        missing = [name for name in self.airframe.detector.parameters if name not in self.parameters]
         self._parameters_due_us = arrival_us + PARAMETERS_US
         self._parameter_tries += 1
         return [self._to_vehicle(Send("PARAM_REQUEST_READ", {"param_id": name, "param_index": -1})) for name in missing]
@@ -535,12 +544,15 @@ class Core:
         flowing = self._rows_us is not None and arrival_us - self._rows_us <= FLOWING_US
         if self.watch.known and not flowing:
             return Send("TIMESYNC", {"tc1": 0, "ts1": max(1, arrival_us * 1000)})
+        return self._heartbeat_of_ours(mavlink.MAV_STATE_ACTIVE if flowing else mavlink.MAV_STATE_STANDBY)
+
+    def _heartbeat_of_ours(self, state: int) -> Send:
         fields: Fields = {
             "type": mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
             "autopilot": mavlink.MAV_AUTOPILOT_INVALID,
             "base_mode": 0,
             "custom_mode": POLICIES.index(self.policy),  # a replay of the log learns the policy from it
-            "system_status": mavlink.MAV_STATE_ACTIVE if flowing else mavlink.MAV_STATE_STANDBY,
+            "system_status": state,
             "mavlink_version": 3,
         }
         return Send("HEARTBEAT", fields)

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.dialect import Definition, by_name
 from companion.frames import Frame
@@ -135,8 +135,7 @@ class ClockKind(Enum):
     USEC64 = "usec64"  # uint64, microseconds since boot or since 1970, the definition leaves it open
 
 
-@dataclass(frozen=True, slots=True)
-class Sampled:
+class Sampled(NamedTuple):
     """What one message says: its own time, and values by the channel's index."""
 
     clock: ClockKind

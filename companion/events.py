@@ -28,7 +28,7 @@ class Kind(StrEnum):
     FAULT = "fault"  # detected, isolated, changed, cleared, inconclusive
     RECOVERY = "recovery"  # considered, refused, requested, acknowledged, verified, rolled_back, failed, vetoed
     CHECK = "check"  # a health check's finding
-    LOG = "log"  # opened, rotated, full
+    LOG = "log"  # opened, rotated, closed, removed, full
     SELF = "self"  # started, stopped, overload, config
     END = "end"  # the last line: why, counters; a missing one says killed
 

@@ -59,6 +59,8 @@ class Speaker:
         return out
 
     def tick(self, now_us: int) -> list[Fields]:
+        if not self._waiting:
+            return []  # the credit is made up for when it is needed
         refill = (now_us - self._refilled_us) // REFILL_US
         if refill > 0:
             self._credit = min(BURST, self._credit + refill)

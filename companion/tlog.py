@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.dialect import MAGIC_V1, recognised
 from companion.errors import UserError
@@ -25,8 +25,7 @@ OWN_LINK: Final = 3
 PLAUSIBLE_US: Final = range(946_684_800_000_000, 4_102_444_800_000_000)  # years 2000 to 2099
 
 
-@dataclass(frozen=True, slots=True)
-class Record:
+class Record(NamedTuple):
     """One frame of a log; stamp_us is None where the frame stood without one."""
 
     stamp_us: int | None
@@ -177,14 +176,16 @@ class Reader:
             report.frames_v1 += 1
         else:
             report.frames_v2 += 1
-        report.signed += frame.signed
+            report.signed += frame.signed
         report.messages[frame.name] += 1
         if frame.definition is None:
             report.unknown_frames += 1
             if (name := recognised(frame.raw, frame.message_id)) is not None:
                 report.recognised[name] += 1
             return
-        source = report.sources.setdefault((frame.sysid, frame.compid), Source())
+        source = report.sources.get((frame.sysid, frame.compid))
+        if source is None:
+            source = report.sources[frame.sysid, frame.compid] = Source()
         source.frames += 1
         if source.last_seq is not None:
             source.seq_lost += (frame.seq - source.last_seq - 1) % 256

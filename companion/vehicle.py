@@ -107,6 +107,8 @@ class Watch:
 
     def silence(self, arrival_us: int) -> tuple[LinkState, int] | None:
         """The next change of the link that silence has brought by now: (state, when); None if there is none."""
+        if arrival_us - self.heard_us <= SILENT_AFTER_US:
+            return None  # asked at every frame, and nearly always so
         for before, after, limit_us in (
             (LinkState.UP, LinkState.SILENT, SILENT_AFTER_US),
             (LinkState.SILENT, LinkState.LOST, LOST_AFTER_US),

@@ -35,6 +35,7 @@ AXES: Final = "xyz"
 
 Triple = tuple[float, float, float]
 
+NAMES: Final = {ending: ("x" + ending, "y" + ending, "z" + ending) for ending in ("acc", "gyro", "mag")}
 # Instance of the sensor by message; HIGHRES_IMU says its own.
 INSTANCES: Final = {"RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
 
@@ -49,14 +50,17 @@ class Quantity(Enum):
     GYRO = ("gyro", 1e-3, "rad/s about", 0.0873)
     ACCELEROMETER = ("acc", MG_M_S2, "m/s2 along", 0.75)
 
+    def __init__(self, ending: str, scale: float, unit: str, apart: float) -> None:
+        # Plain attributes, and the plain hash: `value` and Enum's own hash go through Python at every sample.
+        self.ending, self.scale, self.unit, self.apart = ending, scale, unit, apart
+
+    __hash__ = object.__hash__
+
 
 def triple(fields: Fields, ending: str, scale: float) -> Triple:
     """Fields x, y, z with this ending, times scale."""
-    return (
-        number(fields, "x" + ending) * scale,
-        number(fields, "y" + ending) * scale,
-        number(fields, "z" + ending) * scale,
-    )
+    x, y, z = NAMES[ending]
+    return number(fields, x) * scale, number(fields, y) * scale, number(fields, z) * scale
 
 
 def sensed(name: str, fields: Fields, flight: Flight, quantity: Quantity) -> tuple[int, Triple] | None:
@@ -66,11 +70,11 @@ def sensed(name: str, fields: Fields, flight: Flight, quantity: Quantity) -> tup
     """
     if name == "RAW_IMU" and not flight.ardupilot:
         return None
-    if not any(triple(fields, "acc", 1.0)):
+    if not (fields["xacc"] or fields["yacc"] or fields["zacc"]):
         return None  # no accelerometer reads zero on all axes: there is none (SCALED_IMU3 often holds a compass alone)
     if name == "HIGHRES_IMU":
-        return int(number(fields, "id")), triple(fields, quantity.value[0], 1.0)
-    return INSTANCES[name], triple(fields, quantity.value[0], quantity.value[1])
+        return int(number(fields, "id")), triple(fields, quantity.ending, 1.0)
+    return INSTANCES[name], triple(fields, quantity.ending, quantity.scale)
 
 
 @dataclass(slots=True)
@@ -107,7 +111,7 @@ class Pair:
         judged = {instance: means.windows for instance, means in self._others.items() if len(means.windows) >= LEAST_WINDOWS}
         if not judged:
             return absent("no two sensors side by side for a minute under way")
-        unit, apart = self.quantity.value[2], self.quantity.value[3]
+        unit, apart = self.quantity.unit, self.quantity.apart
         told: list[str] = []
         standing: list[str] = []
         spans: list[Span] = []
@@ -158,7 +162,9 @@ class Frozen:
                 return
             key = (sample[0], quantity)
             same = self._same.get(key)
-            held = self._held.setdefault(key, Held(0.0))
+            held = self._held.get(key)
+            if held is None:
+                held = self._held[key] = Held(0.0)
             if same is None or same[0] != sample[1]:
                 self._same[key] = (sample[1], t_s, self._turned_rad, 1)
                 held.take(t_s, False)

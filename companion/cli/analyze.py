@@ -1,10 +1,10 @@
 """`mavfdi analyze LOG…`: what happened in telemetry logs."""
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from companion import airframe as airframes
 from companion.airframe import Airframe
 from companion.analysis import Analysis, analyze, by_type
 from companion.checks import Status
-from companion.cli import FAILED, arguments
+from companion.cli import FAILED, arguments, compiling
 from companion.decision import Policy
 from companion.errors import UserError
 from companion.events import Json, encode
@@ -68,6 +68,7 @@ def main(args: argparse.Namespace) -> int:
     if args.report is not None and len(paths) != 1:
         raise UserError(f"--report is for one log, not {len(paths)}")
     tasks = [Task(path, args.airframe, args.config, args.policy, args.report) for path in paths]
+    compiling.announce(paths, always=args.report is not None)
     done: list[Done] = []
     progress = _Progress(len(tasks))
     for outcome in _outcomes(tasks, args.jobs):
@@ -105,6 +106,8 @@ def _outcomes(tasks: list[Task], jobs: int) -> Iterator[Done]:
     if jobs == 1 or len(tasks) == 1:
         yield from map(work, tasks)
         return
+    from concurrent.futures import ProcessPoolExecutor  # with its queues and pipes, a tenth of the start
+
     with ProcessPoolExecutor(min(jobs, len(tasks))) as pool:
         yield from pool.map(work, tasks)
 
@@ -182,7 +185,7 @@ def text(found: Analysis) -> str:
     if replay is not None:
         lines += [f"  {_clock(line['t'])}  {line['kind']}/{line['name']}: {line['text']}" for line in replay.journal.lines]
     if "replay" in content:
-        same = isinstance(content["replay"], dict) and content["replay"]["same_sends"]
+        same = isinstance(content["replay"], dict) and content["replay"]["same_settings"]
         lines.append(f"  replay    decided {'the same' if same else 'DIFFERENTLY'} as the recorded run")
     return "\n".join(lines)
 
@@ -237,4 +240,5 @@ def _write_events(path: Path, done: list[Done]) -> None:
     try:
         parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)
     except OSError as error:
-        raise UserError(f"{path}: cannot write here: {error.strerror or error}") from None
+        why = os.strerror(error.errno) if error.errno else str(error)  # pyarrow's own words name the path once more
+        raise UserError(f"{path}: cannot write here: {why}") from None

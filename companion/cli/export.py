@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from companion.cli import compiling
 from companion.errors import UserError
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ def main(args: argparse.Namespace) -> int:
         systems = [int(text) for text in args.systems.split(",")] if args.systems else None
     except ValueError:
         raise UserError(f"--systems {args.systems}: give numbers, for example 1,2") from None
+    compiling.announce([args.log], always=True)
     found = columns.read(args.log).columns(types, systems=systems)
     try:
         args.out.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from companion.analysis import facts
-from companion.cli import FAILED
+from companion.cli import FAILED, compiling
 from companion.errors import UserError
 from companion.events import Json, encode
 
@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def main(args: argparse.Namespace) -> int:
+    compiling.announce(args.logs)
     code = 0
     for path in args.logs:
         try:

@@ -12,10 +12,11 @@ from companion.effects import Effect, Tell
 from companion.errors import UserError
 from companion.journal import Journal
 from companion.live import Live
-from companion.recorder import Recorder, load_record
+from companion.recorder import MEGABYTE, Recorder, Rules, When, load_record
 from companion.recovery import from_record
 
 DEFAULT_LINK = "udpin:127.0.0.1:14550"
+LEAST_SIZE_MB = 0.1  # half a minute of a busy link; anything less is a mistake in the unit
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +25,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policy", choices=[policy.value for policy in Policy], default=Policy.ADVISE.value)
     parser.add_argument(
         "--out", metavar="DIR", type=Path, default=Path("mavfdi-out"), help="folder for log, events, summary"
+    )
+    parser.add_argument(
+        "--log",
+        choices=[when.value for when in When],
+        default=When.ALWAYS.value,
+        help="when frames are recorded; default always",
+    )
+    parser.add_argument(
+        "--log-size",
+        metavar="MB",
+        type=float,
+        default=256.0,
+        help="largest size of a log, then the next one follows; default 256",
+    )
+    parser.add_argument(
+        "--free", metavar="MB", type=float, default=200.0, help="keep so much free by removing the oldest logs; default 200"
     )
     arguments.add_config(parser)
     arguments.add_duration(parser, "stop after so many seconds")
@@ -39,6 +56,7 @@ def main(args: argparse.Namespace) -> int:
             f"--compid {args.compid} is none for an onboard computer; give {FIRST_COMPONENT} to {LAST_COMPONENT}"
         )
     arguments.check_numbers(duration_s=args.duration, sysid=args.sysid)
+    rules = log_rules(args.log, args.log_size, args.free)
     airframe = airframes.load(args.airframe, args.config)
     clock = arguments.companion_clock(args.speedup)
     record = read_record(args.out)
@@ -53,22 +71,30 @@ def main(args: argparse.Namespace) -> int:
             pinned_compid=args.compid is not None,
         )
         observe = None if args.quiet else show
-        live = Live(core, links, clock, Recorder(args.out), Journal(airframe), observe)
+        live = Live(core, links, clock, Recorder(args.out, rules), Journal(airframe), observe)
 
         def stop(why: str) -> None:
             live.stop = why
 
         arguments.on_stop_signal(stop)
         names = ", ".join(link.name for link in links)
-        print(
-            f"mavfdi: {airframe.name} on {names}, policy {args.policy}, recording to {live.recorder.tlog_path}", flush=True
-        )
+        path = live.recorder.events_path if rules.when is When.OFF else live.recorder.tlog_path
+        print(f"mavfdi: {airframe.name} on {names}, policy {args.policy}, recording to {path}", flush=True)
         content = live.run(args.duration)
     finally:
         for link in links:
             link.close()
     print(f"mavfdi: {live.stop}; verdict {content['verdict']}", flush=True)
     return 0
+
+
+def log_rules(when: str, size_mb: float, free_mb: float) -> Rules:
+    """What --log, --log-size and --free ask for.  Raises UserError."""
+    if not LEAST_SIZE_MB <= size_mb < 1e6:  # False for NaN
+        raise UserError(f"--log-size {size_mb:g} is no size of a log; give {LEAST_SIZE_MB:g} MB or more")
+    if not 0.0 <= free_mb < 1e9:
+        raise UserError(f"--free {free_mb:g} is no room on a disk; give MB >= 0, 0 to remove nothing")
+    return Rules(When(when), round(size_mb * MEGABYTE), round(free_mb * MEGABYTE))
 
 
 def read_record(folder: Path) -> str:

@@ -45,7 +45,12 @@ def test_the_log_of_a_run_tells_its_policy_its_events_and_its_sends(flown):
     assert found.replay.core.policy is Policy.AUTO
     assert same_events(flight.lines, found.replay.journal.lines) is None
     sent = [send for send in flight.sends if send.message not in ("HEARTBEAT", "TIMESYNC")]
-    assert found.content["replay"] == {"sends": len(sent), "sends_recorded": len(sent), "same_sends": True}
+    assert found.content["replay"] == {
+        "sends": len(sent),
+        "sends_recorded": len(sent),
+        "same_sends": True,
+        "same_settings": True,
+    }
 
 
 def test_a_log_without_what_a_companion_sent_is_decided_as_advice(flown, tmp_path):
@@ -121,7 +126,9 @@ def test_in_a_log_without_any_stamps_no_vehicle_is_chosen_and_no_event_made_up(f
 
 def test_the_same_comes_out_without_the_compiled_reader(flown, monkeypatch):
     _, path = flown
+    monkeypatch.setattr("companion.analysis.COMPILED_FROM_BYTES", 0)
     expected = analyzed(path).content
+    assert "companion.columns" in sys.modules
     for name in ("companion.columns", "companion.walk"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)

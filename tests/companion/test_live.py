@@ -9,18 +9,21 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from companion.analysis import analyze
 from companion.clock import VehicleClock
 from companion.core import Core
 from companion.decision import Policy
 from companion.dialect import encode
+from companion.events import Severity
 from companion.frames import Splitter
 from companion.journal import Journal
-from companion.live import PEERS, Live
-from companion.recorder import RECORD_NAME, Recorder
+from companion.live import PEERS, RETELL_TRIES, Live
+from companion.recorder import MEGABYTE, RECORD_NAME, News, Recorder, Rules, When
 from companion.recovery import Stage
 from companion.rehearsal import Rehearsal
 from companion.tlog import OWN_LINK, Reader
 from sitl.autopilot import Autopilot, Misbehaviour
+from tests.sitl.network import message
 from tests.system.flights import CROSSED, ORIGINAL, OUTPUTS, SWAPPED, Flight, autopilot, events, names, parafoil
 
 KEY = "companion"
@@ -241,8 +244,12 @@ def test_what_could_not_be_put_back_after_a_kill_is_not_begun(kept, loop, tmp_pa
 
 
 class FullFile:
-    def __init__(self, file, room):
-        self.file, self.room = file, room
+    """Takes the place of a recorder's log."""
+
+    def __init__(self, recorder, room):
+        tlog = recorder._flights._file
+        self.file, self.room = tlog._file, room
+        tlog._file = self
 
     def write(self, data):
         self.room -= len(data)
@@ -250,13 +257,19 @@ class FullFile:
             raise OSError(errno.ENOSPC, "No space left on device")
         return self.file.write(data)
 
+    def truncate(self, size):
+        return self.file.truncate(size)
+
+    def fileno(self):
+        return self.file.fileno()
+
     def close(self):
         self.file.close()
 
 
 def test_a_full_disk_is_told_once_and_the_vehicle_is_mended_all_the_same(loop, tmp_path):
     recorder = Recorder(tmp_path)
-    recorder._tlog = FullFile(recorder._tlog, 50_000)
+    FullFile(recorder, 50_000)
     link = VehicleLink(None, 100.0)
     live, content = loop(link, recorder=recorder)
     assert names(live.journal.lines).count("log/full") == 1
@@ -265,6 +278,136 @@ def test_a_full_disk_is_told_once_and_the_vehicle_is_mended_all_the_same(loop, t
     assert (live.core.recovery.stage, content["verdict"]) == (Stage.DONE, "fault")
     assert content["counters"]["recorder.dropped"] > 1000
     assert tuple(link.autopilot.parameters.value(name) for name in OUTPUTS) == SWAPPED
+
+
+# -- logs -------------------------------------------------------------------------------------------------------------
+
+
+def told_of_logs(lines):
+    """(name, file, next) of the events of the kind `log`."""
+    return [(line["name"], line.get("file"), line.get("next")) for line in lines if line["kind"] == "log"]
+
+
+class Rearmed(VehicleLink):
+    """Told by its ground station to disarm in mid-flight at 10 s, and to arm again at 13 s; the fault comes at 20 s."""
+
+    orders = ((10.0, 0.0), (13.0, 1.0))
+    station = mavlink.MAVLink(None, 255, 190)
+
+    def receive(self):
+        while self.orders and self.autopilot.elapsed_us >= self.orders[0][0] * 1e6:
+            (_, arm), *self.orders = self.orders
+            order = message(
+                "COMMAND_LONG", target_system=1, target_component=1, command=400, param1=arm, param2=21196.0
+            )  # fmt: skip
+            self.autopilot.receive("ground", order.pack(self.station))
+        return super().receive()
+
+
+FAULTS = ("fault/detected", "fault/isolated", "recovery/considered", "recovery/requested")
+
+
+def times(lines):
+    """When the alarm and the repair happened, s on the vehicle's clock."""
+    return {name: line["t"] for line in lines if (name := f"{line['kind']}/{line['name']}") in FAULTS}
+
+
+@pytest.mark.parametrize("when", [When.ALWAYS, When.WHILE_ARMED])
+def test_each_flight_has_a_log_which_by_itself_tells_what_the_run_told(when, loop, tmp_path):
+    link = Rearmed(None, 100.0)
+    live, _ = loop(link, recorder=Recorder(tmp_path, Rules(when)))
+    told = told_of_logs(live.journal.lines)
+    if when is When.ALWAYS:
+        assert told == [("opened", "flight.tlog", None), ("rotated", "flight.tlog", "flight-2.tlog")]
+    else:
+        assert told == [("opened", "flight.tlog", None), ("closed", "flight.tlog", None), ("opened", "flight-2.tlog", None)]
+    first, second = (analyze(tmp_path / name, lambda _: parafoil()) for name in ("flight.tlog", "flight-2.tlog"))
+    assert first.content["faults"] == []
+    live_times = times(live.journal.lines)
+    assert list(live_times) == list(FAULTS)
+    assert times(second.content["events"]) == live_times
+    armed = [line["t"] for line in live.journal.lines if line["name"] == "armed"]
+    assert [line["t"] for line in second.content["events"] if line["name"] == "armed"][-1] == armed[-1]
+    assert second.content["duration_s"] == pytest.approx(100.0 - armed[-1] + 10.0, abs=0.5)
+
+
+def test_a_log_that_begins_in_mid_run_makes_the_parameters_asked_for_until_it_holds_them(loop, tmp_path):
+    link = Rearmed(None, 30.0)
+    link.orders = ((15.0, 0.0), (18.0, 1.0))
+    loop(link)
+    asked = [frame.fields()["param_id"] for frame in sent(link, "PARAM_REQUEST_READ")]
+    assert sorted(asked) == sorted(2 * OUTPUTS)  # once for the run, once for its second log
+    held = [one.frame.fields()["param_id"] for one in Reader(tmp_path / "flight-2.tlog") if one.frame.name == "PARAM_VALUE"]
+    assert sorted(held) == sorted(OUTPUTS)
+
+
+def test_a_log_that_begins_in_mid_flight_makes_the_parameters_asked_for_too(loop, tmp_path):
+    link = VehicleLink(None, 20.0)
+    news = News("rotated", Severity.INFO, "flight.tlog is complete", "256 MB is the most for a file")
+
+    class Outgrown(Recorder):
+        """Tells of a rotation in the tenth second."""
+
+        def news(self):
+            due = link.autopilot.elapsed_us == 10_000_000 and news not in given
+            given.extend([news] * due)
+            return super().news() + [news] * due
+
+    given = []
+    loop(link, recorder=Outgrown(tmp_path))
+    asked = [frame.fields()["param_id"] for frame in sent(link, "PARAM_REQUEST_READ")]
+    assert sorted(asked) == sorted(2 * OUTPUTS)
+
+
+def test_the_first_log_of_a_run_holds_no_request_that_its_replay_does_not_make(loop, tmp_path):
+    loop(VehicleLink(None, 60.0))
+    found = analyze(tmp_path / "flight.tlog", lambda _: parafoil())
+    assert found.content["replay"]["same_sends"]
+
+
+def test_parameters_that_no_longer_answer_are_asked_for_a_bounded_number_of_times_for_a_log(loop):
+    link = Rearmed(None, 30.0)
+
+    def deaf(key, data):
+        (frame,) = Splitter().feed(data)
+        if frame.name != "PARAM_REQUEST_READ" or link.autopilot.elapsed_us < 12_000_000:
+            heard(key, data)
+
+    heard, link.autopilot.receive = link.autopilot.receive, deaf
+    loop(link)
+    asked = [frame.fields()["param_id"] for frame in sent(link, "PARAM_REQUEST_READ")]
+    assert sorted(asked) == sorted((1 + RETELL_TRIES) * OUTPUTS)
+
+
+def test_with_no_log_events_and_summary_are_kept_all_the_same(loop, tmp_path):
+    live, content = loop(VehicleLink(None, 12.0), recorder=Recorder(tmp_path, Rules(When.OFF)))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["events.jsonl", "summary.json"]
+    assert told_of_logs(live.journal.lines) == []
+    assert content["counters"]["recorder.dropped"] == 0
+
+
+def test_removed_logs_are_told_with_name_and_size(loop, tmp_path, monkeypatch):
+    (tmp_path / "flight.tlog").write_bytes(bytes(MEGABYTE))
+    free = iter([0, MEGABYTE])
+    monkeypatch.setattr("companion.recorder.free_bytes", lambda _: next(free, MEGABYTE))
+    live, _ = loop(VehicleLink(None, 3.0), recorder=Recorder(tmp_path, Rules(free_bytes=MEGABYTE // 2)))
+    removed, opened = [line for line in live.journal.lines if line["kind"] == "log"]
+    assert (removed["name"], removed["file"], removed["bytes"]) == ("removed", "flight.tlog", MEGABYTE)
+    assert (opened["name"], opened["file"]) == ("opened", "flight-2.tlog")
+    assert events(tmp_path / "events-2.jsonl") == live.journal.lines
+
+
+def test_without_room_from_the_start_the_vehicle_is_watched_and_the_ground_told(loop, tmp_path, monkeypatch):
+    monkeypatch.setattr("companion.recorder.free_bytes", lambda _: 0)
+    link = VehicleLink(None, 45.0)
+    live, _ = loop(link)
+    full = [line for line in events(tmp_path / "events.jsonl") if line["kind"] == "log"]
+    assert [line["text"] for line in full] == ["recording stopped: less than 200 MB free on the disk; monitoring goes on"]
+    assert [frame.fields()["text"] for frame in sent(link, "STATUSTEXT")].count(
+        "mavfdi: disk trouble, monitoring goes on"
+    ) == 1  # though the arming has tried again
+    assert "fault/detected" in names(live.journal.lines)
+    assert not (tmp_path / "flight.tlog").exists()
 
 
 # -- a good component -------------------------------------------------------------------------------------------------

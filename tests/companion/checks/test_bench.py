@@ -2,7 +2,6 @@
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,7 +152,7 @@ def test_no_value_on_the_wire_raises_anything(log, kind, autopilot):
         )
         if message.name == "HEARTBEAT":
             payload = flight.records[0][0].payload
-        frame = replace(flight.records[0][0], message_id=message.id, definition=message, payload=payload)
+        frame = flight.records[0][0]._replace(message_id=message.id, definition=message, payload=payload)
         bench.take(frame, START_US + k * 20_000)
     assert len(bench.finish()) == len(CHECKS)
 
