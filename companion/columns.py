@@ -10,7 +10,8 @@ import mmap
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -57,9 +58,9 @@ class Columns:
     units: Mapping[str, str]  # SI unit's suffix by field ("m_s"), "1" for none
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Index:
-    """Where the frames of a log are."""
+    """Where the frames of a log are.  `report` is made when it is first asked for."""
 
     data: NDArray[np.uint8]
     starts: NDArray[np.int64]  # of the magic byte
@@ -69,11 +70,18 @@ class Index:
     sources: NDArray[np.uint16]  # sysid * 256 + compid
     seqs: NDArray[np.uint8]
     stamps_us: NDArray[np.uint64]  # with the link's bits; 0 where there is none
-    report: Report
+    damage: Report  # what the walk alone can count
     gaps: tuple[tuple[int, int], ...]  # the first skipped stretches: offset, length
 
     def __len__(self) -> int:
         return len(self.starts)
+
+    @cached_property
+    def report(self) -> Report:
+        """Everything that `tlog.Reader` counts, but for the two digests of `hash`."""
+        report = replace(self.damage, crc_failure_ids=self.damage.crc_failure_ids.copy())
+        _fill_report(self, report)
+        return report
 
     def hash(self) -> None:
         """Fill in the report's two digests; apart from the reading, since they take longer than it."""
@@ -131,14 +139,15 @@ class Index:
         return self._columns(chosen)
 
     def _columns(self, chosen: NDArray[np.bool_]) -> dict[str, Columns]:
-        ids = self.ids if chosen.all() else self.ids[chosen]
+        everything = bool(chosen.all())
+        ids = self.ids if everything else self.ids[chosen]
         counts = np.bincount(ids, minlength=len(walk.seeds()))
         sizes = payload_sizes()
         next_row = np.concatenate(([0], np.cumsum(counts)))
         first_row = next_row.copy()
-        frames = np.empty(len(ids), dtype=np.int64)
-        stamps_us = np.empty(len(ids), dtype=np.uint64)
-        sysids, compids = np.empty(len(ids), dtype=np.uint8), np.empty(len(ids), dtype=np.uint8)
+        rows = len(ids)
+        frames, stamps_us = np.empty(rows, dtype=np.int64), np.empty(rows, dtype=np.uint64)
+        sysids, compids = np.empty(rows, dtype=np.uint8), np.empty(rows, dtype=np.uint8)
         found: dict[int, _Fields] = {}
         for message_id in np.flatnonzero(counts).tolist():
             message = definition(message_id)
@@ -146,7 +155,8 @@ class Index:
             found[message_id] = _Fields(message, int(counts[message_id]))
         for first in range(0, len(self), BLOCK):
             part = slice(first, first + BLOCK)
-            counts = np.bincount(self.ids[part][chosen[part]], minlength=len(walk.seeds()))
+            ids = self.ids[part] if everything else self.ids[part][chosen[part]]
+            counts = np.bincount(ids, minlength=len(walk.seeds()))
             ends = np.cumsum(counts * sizes)
             payloads = np.empty(int(ends[-1]), dtype=np.uint8)
             walk.spread(
@@ -243,7 +253,7 @@ def read(path: Path) -> Index:
     if not count:
         raise UserError(f"{path}: no MAVLink frame in {data.size} bytes; is it a telemetry log?")
     gaps = skips[: 2 * min(NOTED, int(counters[walk.GAPS]))].reshape(-1, 2)
-    report = Report(
+    damage = Report(
         bytes=data.size,
         resyncs=int(counters[walk.RESYNCS]),
         resync_bytes=int(counters[walk.RESYNC_BYTES]),
@@ -251,7 +261,7 @@ def read(path: Path) -> Index:
         crc_failures=int(counters[walk.CRC_FAILURES]),
         crc_failure_ids=Counter(failed_ids[: int(counters[walk.CRC_FAILURES])].tolist()),
     )
-    index = Index(
+    return Index(
         data,
         starts[:count],
         sizes[:count],
@@ -260,11 +270,9 @@ def read(path: Path) -> Index:
         sources[:count],
         seqs[:count],
         stamps_us[:count],
-        report,
+        damage,
         tuple((int(at), int(size)) for at, size in gaps),
     )
-    _fill_report(index)
-    return index
 
 
 def _let_go(data: NDArray[np.uint8]) -> None:
@@ -287,8 +295,8 @@ def _bytes(path: Path) -> NDArray[np.uint8]:
         raise UserError(f"{path}: cannot read the log: {error}") from None
 
 
-def _fill_report(index: Index) -> None:
-    report, flags = index.report, index.flags
+def _fill_report(index: Index, report: Report) -> None:
+    flags = index.flags
     report.frames_v2 = int(np.count_nonzero(flags & walk.IS_V2))
     report.frames_v1 = len(index) - report.frames_v2
     report.signed = int(np.count_nonzero(flags & walk.IS_SIGNED))
