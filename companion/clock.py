@@ -7,6 +7,10 @@ a tlog keeps the link's number in the two lowest bits: what is decided live is d
 import time
 from typing import Final, Protocol
 
+from pymavlink.dialects.v20.all import MAV_COMP_ID_AUTOPILOT1
+
+from companion.frames import Frame
+
 STAMP_US: Final = 4
 REBOOT_BACK_US: Final = 1_000_000  # a vehicle's clock further back than this has been started anew
 
@@ -25,6 +29,15 @@ class Clock(Protocol):
 
     def arrival_us(self, looked_us: int, pause_s: float) -> int:
         """The stamp of bytes found now by a loop that has last looked at looked_us and looks every pause_s."""
+
+
+def follow(clock: Clock, frame: Frame) -> None:
+    """In lockstep the simulator tells by TIMESYNC how far it has come; whoever takes its frames passes them here first."""
+    if frame.name == "TIMESYNC" and frame.compid == MAV_COMP_ID_AUTOPILOT1:
+        fields = frame.fields()
+        asked_ns = fields["ts1"]
+        if fields["tc1"] == 0 and isinstance(asked_ns, int):
+            clock.advance_to(asked_ns // 1000)
 
 
 class WallClock:

@@ -10,9 +10,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from pymavlink.dialects.v20.all import MAV_COMP_ID_AUTOPILOT1
-
-from companion.clock import Clock
+from companion.clock import Clock, follow
 from companion.core import Core
 from companion.dialect import Fields, encode
 from companion.effects import Effect, Save, Send, Tell
@@ -118,11 +116,7 @@ class Live:
         return found
 
     def _take(self, frame: Frame, link: int) -> None:
-        if frame.name == "TIMESYNC" and frame.compid == MAV_COMP_ID_AUTOPILOT1:
-            fields = frame.fields()
-            asked_ns = fields["ts1"]
-            if fields["tc1"] == 0 and isinstance(asked_ns, int):
-                self.clock.advance_to(asked_ns // 1000)
+        follow(self.clock, frame)
         self._stamp_us = max(self._stamp_us, self.clock.arrival_us(self._looked_us, PAUSE_S))
         self.recorder.frame(self._stamp_us, link, frame.raw)
         self._perform(self.core.frame(frame, self._stamp_us))

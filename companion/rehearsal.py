@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.airframe import Airframe
-from companion.clock import VehicleClock
+from companion.clock import VehicleClock, follow
 from companion.core import Core
 from companion.decision import Policy
 from companion.dialect import encode
 from companion.effects import Effect, Save, Send
-from companion.frames import Frame, Splitter
+from companion.frames import Splitter
 from companion.journal import Journal
 from companion.tlog import OWN_LINK, record
 from sitl.autopilot import Autopilot
@@ -75,18 +75,11 @@ class Rehearsal:
 
     def _hear(self, data: bytes) -> None:
         for frame in self._splitter.feed(data):
-            self._follow_clock(frame)
+            follow(self._clock, frame)
             stamp_us = self._clock.now_us()
             if self.keep_log:
                 self.log += record(stamp_us, 0, frame.raw)
             self._perform(self.core.frame(frame, stamp_us))
-
-    def _follow_clock(self, frame: Frame) -> None:
-        if frame.name == "TIMESYNC":
-            fields = frame.fields()
-            asked_ns = fields["ts1"]
-            if fields["tc1"] == 0 and isinstance(asked_ns, int):
-                self._clock.advance_to(asked_ns // 1000)
 
     def _perform(self, effects: Sequence[Effect]) -> None:
         self.journal.take(effects, self.core.watch.sysid)
