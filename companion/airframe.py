@@ -20,6 +20,7 @@ from companion.configuration import Configuration, Source
 from companion.decode import Decoder
 from companion.errors import UserError
 from companion.recovery import Plan
+from fdi.kernel import Compiler
 from fdi.verdict import Fault, Monitor, Signature
 
 ENTRY_POINTS: Final = "mavfdi.airframes"
@@ -36,7 +37,7 @@ class Detector:
     signals: tuple[str, ...]  # SIGNALS
     signatures: tuple[Signature, ...]  # SIGNATURES
     config: type[Any]  # Config: the record of the [monitor] table
-    monitor: Callable[..., Monitor]  # Monitor(config, flights=n)
+    monitor: Callable[..., Monitor]  # Monitor(config, flights=n, compiler=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +51,9 @@ class Airframe:
     source: Source
     simulator: str | None  # module name, imported only by the commands that fly it
 
-    def monitor(self, flights: int = 1) -> Monitor:
-        return self.detector.monitor(self.monitor_config, flights=flights)
+    def monitor(self, flights: int = 1, compiler: Compiler | None = None) -> Monitor:
+        """compiler: for a monitor that has much to do and is made of kernels (companion/compiler.py)."""
+        return self.detector.monitor(self.monitor_config, flights=flights, compiler=compiler)
 
     def plan(self, fault: Fault) -> Plan | None:
         """What mends this fault: by its id, else by its class."""

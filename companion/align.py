@@ -58,6 +58,7 @@ class Aligner:
     counts: Counter[str] = field(default_factory=Counter)
     newest_us: int | None = None  # newest vehicle time heard
     offset_us: int | None = None  # arrival - vehicle time, at its smallest
+    due_us: float = math.inf  # arrival stamp at which the open row is overdue; no row is before a clock is known
     _next_us: int = 0  # time of the open row
     _restart: Restart | None = None
     _half_windows: list[int | None] = field(default_factory=lambda: [None, None])
@@ -86,7 +87,9 @@ class Aligner:
             return []
         else:
             t_us = self._without_clock(arrival_us)
-        rows = self._close_before(t_us)
+        rows: list[GridRow] = []
+        while self._next_us < t_us:
+            rows.append(self._close())
         for channel, value in sampled.values:
             if t_us >= self._stamps_us[channel] or math.isnan(self._values[channel]):
                 self._stamps_us[channel] = t_us
@@ -96,12 +99,11 @@ class Aligner:
     def due(self, arrival_us: int) -> list[GridRow]:
         """The rows that are overdue at this arrival stamp, oldest first."""
         rows: list[GridRow] = []
-        if self.newest_us is None or self.offset_us is None:
-            return rows
-        last_us = arrival_us - self.offset_us - self.period_us - 1
-        if last_us < self._next_us:
+        if arrival_us < self.due_us:
             return rows  # asked at every frame, and nearly always so
-        last_us = min(last_us, self.newest_us + PAUSE_AFTER_US)
+        assert self.newest_us is not None  # else no row were due
+        assert self.offset_us is not None
+        last_us = min(arrival_us - self.offset_us - self.period_us - 1, self.newest_us + PAUSE_AFTER_US)
         while self._next_us <= last_us:
             rows.append(self._close())
         return rows
@@ -179,6 +181,7 @@ class Aligner:
         newest = self._half_windows[1]
         self._half_windows[1] = offset_us if newest is None else min(newest, offset_us)
         self.offset_us = min(offset for offset in self._half_windows if offset is not None)
+        self.due_us = self._next_us + self.offset_us + self.period_us + 1
 
     def _without_clock(self, arrival_us: int) -> int:
         """Time of a sample whose message carries none.
@@ -190,23 +193,16 @@ class Aligner:
         assert self.offset_us is not None
         return max(self.newest_us, arrival_us - self.offset_us - self.period_us)
 
-    def _close_before(self, t_us: int) -> list[GridRow]:
-        rows: list[GridRow] = []
-        while self._next_us < t_us:
-            rows.append(self._close())
-        return rows
-
     def _close(self) -> GridRow:
         t_us = self._next_us
-        count = len(self._values)
-        values = np.full((1, count), np.nan)
-        age_s = np.full((1, count), np.nan)
-        for channel, (stamp_us, value) in enumerate(zip(self._stamps_us, self._values, strict=True)):
+        values, ages_s = [], []
+        for stamp_us, value, maximal_us in zip(self._stamps_us, self._values, self.maximal_age_us, strict=True):
             age_us = t_us - stamp_us
-            if 0 <= age_us <= self.maximal_age_us[channel] and not math.isnan(value):
-                values[0, channel] = value
-                age_s[0, channel] = age_us * 1e-6
-        row = GridRow(t_us, values, age_s, self._restart)
+            held = 0 <= age_us <= maximal_us and not math.isnan(value)
+            values.append(value if held else math.nan)
+            ages_s.append(age_us * 1e-6 if held else math.nan)
+        row = GridRow(t_us, np.array([values], dtype=np.float64), np.array([ages_s], dtype=np.float64), self._restart)
         self._restart = None
         self._next_us = t_us + self.period_us
+        self.due_us += self.period_us
         return row

@@ -4,10 +4,9 @@ The index costs 27 bytes a frame beside the file itself; columns are made of wha
 reads frame by frame comes out here the same, faster by two orders of magnitude.
 """
 
-import gzip
 import hashlib
+import math
 import mmap
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,14 +17,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from companion import walk
+from companion import unpacking, walk
 from companion.decode import WIRE_UNITS
 from companion.dialect import Definition, by_name, definition, known_ids, recognised
 from companion.errors import UserError
 from companion.frames import Frame
-from companion.tlog import PLAUSIBLE_US, Record, Report, Source
+from companion.tlog import PLAUSIBLE_US, Record, Report, Source, content
 
 BLOCK: Final = 1 << 18  # frames between two moments in which memory is given back
+CACHED: Final = 1 << 16  # frames turned into columns at once: few enough for the cache, many of each type
 SMALLEST: Final = 8  # bytes of the smallest frame, without a stamp
 NOTED: Final = 1 << 16  # failures and gaps that are remembered one by one
 DTYPES: Final[Mapping[str, str]] = {
@@ -54,7 +54,9 @@ class Columns:
     stamp_us: NDArray[np.uint64]  # as they stand less the link's bits; 0 where there is none
     sysid: NDArray[np.uint8]
     compid: NDArray[np.uint8]
-    fields: Mapping[str, Column]  # SI where MAVLink states a unit that `decode.WIRE_UNITS` knows; else as on the wire
+    # SI where MAVLink states a unit that `decode.WIRE_UNITS` knows: float64, the bits of the live path's samples; where the
+    # unit is SI already, or is not known, as on the wire, in the wire's kind of number.
+    fields: Mapping[str, Column]
     units: Mapping[str, str]  # SI unit's suffix by field ("m_s"), "1" for none
 
 
@@ -119,6 +121,7 @@ class Index:
     ) -> dict[str, Columns]:
         """Messages by type name: all of them, or those of some types, systems, and stamps in [from_us, to_us).
 
+        What one call gives lies in one stretch of memory, and stays as long as any of it: copy the little that you keep.
         Raises UserError for a type that the dialect does not have.
         """
         chosen = (self.flags & walk.IS_UNKNOWN) == 0
@@ -139,79 +142,112 @@ class Index:
         return self._columns(chosen)
 
     def _columns(self, chosen: NDArray[np.bool_]) -> dict[str, Columns]:
-        everything = bool(chosen.all())
-        ids = self.ids if everything else self.ids[chosen]
-        counts = np.bincount(ids, minlength=len(walk.seeds()))
-        sizes = payload_sizes()
-        next_row = np.concatenate(([0], np.cumsum(counts)))
-        first_row = next_row.copy()
-        rows = len(ids)
-        frames, stamps_us = np.empty(rows, dtype=np.int64), np.empty(rows, dtype=np.uint64)
-        sysids, compids = np.empty(rows, dtype=np.uint8), np.empty(rows, dtype=np.uint8)
-        found: dict[int, _Fields] = {}
-        for message_id in np.flatnonzero(counts).tolist():
-            message = definition(message_id)
-            assert message is not None  # unknown ids were not chosen
-            found[message_id] = _Fields(message, int(counts[message_id]))
-        for first in range(0, len(self), BLOCK):
-            part = slice(first, first + BLOCK)
-            ids = self.ids[part] if everything else self.ids[part][chosen[part]]
-            counts = np.bincount(ids, minlength=len(walk.seeds()))
-            ends = np.cumsum(counts * sizes)
-            payloads = np.empty(int(ends[-1]), dtype=np.uint8)
-            walk.spread(
-                *(self.data, first, self.starts[part], self.ids[part], self.sources[part], self.stamps_us[part]),
-                *(chosen[part], sizes, ends - counts * sizes, next_row, payloads, frames, stamps_us, sysids, compids),
+        by_id = np.zeros(len(walk.seeds()), dtype=np.int64)
+        unpacking.count_ids(self.ids, chosen, by_id)
+        ids = np.flatnonzero(by_id)
+        counts = by_id[ids]
+        types = np.zeros(len(by_id), dtype=np.int16)
+        types[ids] = np.arange(len(ids))
+        sizes = payload_sizes()[ids].astype(np.uint64)
+        row_ends = np.cumsum(counts)
+        first_row = (row_ends - counts).astype(np.uint64)
+        next_row = first_row.copy()
+        rows = unpacking.Rows.empty(int(counts.sum()))
+        messages = [_known(message_id) for message_id in ids.tolist()]
+        memory, columns, fields = _room(messages, counts.tolist())
+        out = unpacking.values(memory)
+        order = np.empty(CACHED, dtype=np.uint32)
+        payloads = np.empty(CACHED * ((int(sizes.max(initial=8)) + 7) // 8), dtype=np.uint64)
+        wire = unpacking.values_at_every_byte(payloads.view(np.uint8))
+        frames = walk.Frames(self.starts, self.sizes, self.flags, self.ids, self.sources, self.seqs, self.stamps_us)
+        for first in range(0, len(self), CACHED):
+            part = slice(first, first + CACHED)
+            unpacking.fill(
+                *(self.data, first, frames.part(part), chosen[part], types, sizes, first_row, next_row, fields),
+                *(order, payloads, wire, rows, out),
             )
-            for message_id in np.flatnonzero(counts).tolist():
-                end = int(ends[message_id])
-                size = int(sizes[message_id])
-                found[message_id].take(payloads[end - int(counts[message_id]) * size : end].reshape(-1, size))
             _let_go(self.data)
-        out: dict[str, Columns] = {}
-        for message_id, fields in found.items():
-            own = slice(first_row[message_id], next_row[message_id])
-            name = fields.message.name
-            out[name] = Columns(name, frames[own], stamps_us[own], sysids[own], compids[own], fields.columns, fields.units)
-        return out
+        found: dict[str, Columns] = {}
+        for message, end, count, own in zip(messages, row_ends.tolist(), counts.tolist(), columns, strict=True):
+            kept = rows.part(slice(end - count, end))
+            units = {name: _unit(message, name)[0] for name in message.fields}
+            found[message.name] = Columns(message.name, kept.frames, kept.stamps_us, kept.sysids, kept.compids, own, units)
+        return found
 
 
-class _Fields:
-    """The columns of one message type, filled block by block: payloads are converted while they are in the cache."""
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """One field of a message type, on the wire and as a column."""
 
-    def __init__(self, message: Definition, rows: int) -> None:
-        self.message = message
-        self.columns: dict[str, Column] = {}
-        self.units: dict[str, str] = {}
-        self._factors: dict[str, float] = {}
-        self._dtype = row_dtype(message)
-        self._filled = 0
-        for name in message.fields:
-            self.units[name], self._factors[name] = WIRE_UNITS.get(message.units.get(name, ""), ("1", 1.0))
-            kind = self._dtype[name]
-            base = np.dtype(np.float64) if self._factors[name] != 1.0 else kind.base
-            self.columns[name] = np.empty((rows, *kind.shape), dtype=base)
+    name: str
+    offset: int  # bytes from the payload's begin
+    number: np.dtype[np.generic]  # as which it is read; characters one by one
+    elements: int
+    factor: float
+    shape: tuple[int, ...]  # of a row of the column
+    kept: np.dtype[np.generic]
 
-    def take(self, rows: NDArray[np.uint8]) -> None:
-        """Further payloads, (row, byte)."""
-        structured = rows.view(self._dtype)[:, 0]
-        place = slice(self._filled, self._filled + len(rows))
-        self._filled += len(rows)
-        for name, column in self.columns.items():
-            factor = self._factors[name]
-            if factor == 1.0:
-                column[place] = structured[name]
-            else:
-                np.multiply(structured[name], factor, out=column[place])
+    def place(self, byte: int) -> int:
+        """Where a column that begins at this byte does so, in numbers of the kind that are written to it."""
+        return byte // (self.kept if self.factor != 1.0 else self.number).itemsize
+
+
+def _fields(message: Definition) -> Iterator[_Field]:
+    for name, (dtype, offset, *_) in (row_dtype(message).fields or {}).items():
+        factor, element = _unit(message, name)[1], dtype.base
+        number = np.dtype(np.uint8) if element.kind == "S" else element
+        kept = np.dtype(np.float64) if factor != 1.0 else element
+        yield _Field(name, offset, number, dtype.itemsize // number.itemsize, factor, dtype.shape, kept)
+
+
+def _room(
+    messages: list[Definition], counts: list[int]
+) -> tuple[NDArray[np.uint8], list[dict[str, Column]], unpacking.Fields]:
+    """The memory of all columns, the columns in it by type and field, and the table by which they are filled.
+
+    One stretch of memory: the system gives a large one in large pages, and columns one by one in small pages, which take
+    longer to come by than the numbers that are put into them.
+    """
+    fields, begins, first, size = [], [], [0], 0
+    for message, count in zip(messages, counts, strict=True):
+        for field in _fields(message):
+            fields.append(field)
+            begins.append(size)
+            row_bytes = math.prod(field.shape) * field.kept.itemsize
+            size += -(-count * row_bytes // 8) * 8  # so that each begins at a whole number of any kind
+        first.append(len(fields))
+    memory = np.empty(size, dtype=np.uint8)
+    columns: list[dict[str, Column]] = []
+    for count, begin, end in zip(counts, first[:-1], first[1:], strict=True):
+        own = zip(fields[begin:end], begins[begin:end], strict=True)
+        columns.append({field.name: np.ndarray((count, *field.shape), field.kept, memory, at) for field, at in own})
+    table = unpacking.Fields(
+        np.array(first, np.int64),
+        np.array([field.offset for field in fields], np.uint64),
+        np.array([unpacking.Values._fields.index(field.number.str[1:]) for field in fields], np.int64),
+        np.array([field.elements for field in fields], np.uint64),
+        np.array([field.factor for field in fields], np.float64),
+        np.array([field.place(at) for field, at in zip(fields, begins, strict=True)], np.uint64),
+    )
+    return memory, columns, table
+
+
+def _unit(message: Definition, name: str) -> tuple[str, float]:
+    """The suffix of a field's SI unit, and the factor to it."""
+    return WIRE_UNITS.get(message.units.get(name, ""), ("1", 1.0))
+
+
+def _known(message_id: int) -> Definition:
+    found = definition(message_id)
+    assert found is not None  # the id is the dialect's own
+    return found
 
 
 def payload_sizes() -> NDArray[np.int64]:
     """By message id: bytes of the whole payload, extensions included."""
     sizes = np.zeros(len(walk.seeds()), dtype=np.int64)
     for message_id in known_ids():
-        found = definition(message_id)
-        assert found is not None  # the ids are the dialect's own
-        sizes[message_id] = found.layout.size
+        sizes[message_id] = _known(message_id).layout.size
     return sizes
 
 
@@ -232,21 +268,20 @@ def is_compiled() -> bool:
 
 def read(path: Path) -> Index:
     """Index a log, `.tlog` or `.tlog.gz`.  Raises UserError for a file that cannot be read or holds no frame."""
-    data = _bytes(path)
+    data = np.frombuffer(content(path), dtype=np.uint8)
+    if not data.size:
+        raise UserError(f"{path}: no MAVLink frame in 0 bytes; is it a telemetry log?")
     counters = np.zeros(walk.COUNTERS, np.int64)
     failed_ids, skips = np.empty(NOTED, np.int64), np.empty(2 * NOTED, np.int64)
     # Room for as many frames as there can be: memory that is never touched is never taken.
     room = data.size // SMALLEST + 1
-    starts, stamps_us = np.empty(room, np.int64), np.empty(room, np.uint64)
-    sizes, sources = np.empty(room, np.uint16), np.empty(room, np.uint16)
-    flags, seqs, ids = np.empty(room, np.uint8), np.empty(room, np.uint8), np.empty(room, np.int32)
+    frames = walk.Frames.empty(room)
     count, position = 0, 0
     while position < data.size:
         rest = slice(count, count + BLOCK)
         more, position = walk.walk(
             *(data, position, walk.seeds(), walk.crc_tables()),
-            *(part[rest] for part in (starts, sizes, flags, ids, sources, seqs, stamps_us)),
-            *(counters, failed_ids, skips),
+            *(frames.part(rest), counters, failed_ids, skips),
         )
         count += more
         _let_go(data)
@@ -261,15 +296,16 @@ def read(path: Path) -> Index:
         crc_failures=int(counters[walk.CRC_FAILURES]),
         crc_failure_ids=Counter(failed_ids[: int(counters[walk.CRC_FAILURES])].tolist()),
     )
+    found = frames.part(slice(count))
     return Index(
         data,
-        starts[:count],
-        sizes[:count],
-        flags[:count],
-        ids[:count],
-        sources[:count],
-        seqs[:count],
-        stamps_us[:count],
+        found.starts,
+        found.sizes,
+        found.flags,
+        found.ids,
+        found.sources,
+        found.seqs,
+        found.stamps_us,
         damage,
         tuple((int(at), int(size)) for at, size in gaps),
     )
@@ -283,18 +319,6 @@ def _let_go(data: NDArray[np.uint8]) -> None:
         mapping.madvise(mmap.MADV_DONTNEED)
 
 
-def _bytes(path: Path) -> NDArray[np.uint8]:
-    try:
-        if path.suffix == ".gz":
-            return np.frombuffer(gzip.decompress(path.read_bytes()), dtype=np.uint8)
-        with path.open("rb") as file:
-            if not path.stat().st_size:
-                raise UserError(f"{path}: no MAVLink frame in 0 bytes; is it a telemetry log?")
-            return np.frombuffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), dtype=np.uint8)
-    except (OSError, EOFError, zlib.error) as error:
-        raise UserError(f"{path}: cannot read the log: {error}") from None
-
-
 def _fill_report(index: Index, report: Report) -> None:
     flags = index.flags
     report.frames_v2 = int(np.count_nonzero(flags & walk.IS_V2))
@@ -305,9 +329,7 @@ def _fill_report(index: Index, report: Report) -> None:
     report.unknown_frames = int(np.count_nonzero(~known))
     counts = np.bincount(index.ids[known], minlength=1)  # unknown ids may be as large as 24 bits: counted by themselves
     for message_id in np.flatnonzero(counts).tolist():
-        found = definition(message_id)
-        assert found is not None  # known
-        report.messages[found.name] = int(counts[message_id])
+        report.messages[_known(message_id).name] = int(counts[message_id])
     for message_id, count in zip(*np.unique(index.ids[~known], return_counts=True), strict=True):
         report.messages[f"UNKNOWN_{message_id}"] = int(count)
     for number in np.flatnonzero(~known).tolist():

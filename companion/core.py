@@ -24,18 +24,24 @@ from companion.frames import Frame
 from companion.recovery import Evidence, Plan, Recovery, Said, Stage
 from companion.statustext import Speaker
 from companion.streams import Streams
-from companion.vehicle import Heartbeat, LinkState, Watch, heartbeat
+from companion.vehicle import SILENT_AFTER_US, Heartbeat, LinkState, Watch, heartbeat
+from fdi.kernel import Compiler
 from fdi.verdict import NO_FAULT, Fault, Monitor, Phase, Verdict
 
 BEAT_US: Final = 1_000_000
 FLOWING_US: Final = 3_000_000  # we beat only while rows were judged within so long: a heartbeat must not outlive the work
 PARAMETERS_US: Final = 2_000_000  # the vehicle's parameters are asked for again after so long
 PARAMETER_TRIES: Final = 10
+NEVER_US: Final = 1 << 63
 FIRST_COMPONENT: Final = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 LAST_COMPONENT: Final = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER4
 DOUBLES: Final = 3  # heartbeats under our ids that we did not send, before we move on
 POLICY_PARAMETER: Final = "MFDI_POLICY"
 POLICIES: Final = (Policy.OFF, Policy.ADVISE, Policy.AUTO)  # by the parameter's value and the heartbeat's custom_mode
+REQUESTS: Final = frozenset(  # by name, what somebody may ask of our own component
+    {"TIMESYNC", "COMMAND_LONG", "COMMAND_INT", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET"}
+)
+GONE: Final = (LinkState.SILENT, LinkState.LOST)
 VETO: Final = mavlink.MAV_CMD_USER_1
 CONFIRM: Final = mavlink.MAV_CMD_USER_2
 
@@ -75,6 +81,7 @@ class Core:
     record: str = ""
     compid: int = FIRST_COMPONENT
     pinned_compid: bool = False
+    compiler: Compiler | None = None  # for the monitor, where a whole log is waiting
     counts: Counter[str] = field(default_factory=Counter)
     watch: Watch = field(init=False)
     aligner: Aligner = field(init=False)
@@ -108,7 +115,7 @@ class Core:
         self.watch = Watch(self.pinned_sysid)
         self.decoder = Decoder(channels)
         self.aligner = Aligner(config.grid.period_us, config.grid.maximal_age_us(channels))
-        self.monitor = self.airframe.monitor()
+        self.monitor = self.airframe.monitor(compiler=self.compiler)
         self._streams = Streams(config.streams)
 
     @property
@@ -121,60 +128,57 @@ class Core:
     def frame(self, frame: Frame, arrival_us: int) -> list[Effect]:
         """One frame that arrived at this stamp (`tick` with the same stamp is included)."""
         out = self.tick(arrival_us)
-        if frame.definition is None:
+        message = frame.definition
+        if message is None:
             self.counts["unknown"] += 1
             return out
-        name = frame.definition.name
+        name = message.name
         if name == "HEARTBEAT":
             self._heartbeat(heartbeat(frame), out)
-        if frame.sysid == self.sysid and frame.compid == self.compid:
+        if frame.compid == self.compid and frame.sysid == self.sysid:
             return out
-        if not self.watch.is_autopilot(frame):
+        watch = self.watch
+        if frame.compid != watch.compid or frame.sysid != watch.sysid:
             if frame.sysid != self.sysid:
                 self.counts["foreign"] += 1
-            self._request(frame, out)
+            if name in REQUESTS:
+                self._request(frame, out)
             return out
         self.counts["messages"] += 1
         self._streams.heard(name)
-        self.watch.heard_us = arrival_us
-        if self.watch.link in (LinkState.SILENT, LinkState.LOST):
-            self.watch.link = LinkState.UP
+        watch.heard_us = arrival_us
+        if watch.link in GONE:
+            watch.link = LinkState.UP
             self._tell(out, Event(Kind.LINK, "up", Severity.NOTICE, "the vehicle is heard again"), "link is back")
             out += self._streams.ask(arrival_us)
         sampled = self.decoder.decode(frame)
         if sampled is not None:
             for row in self.aligner.push(sampled, arrival_us):
                 self._row(row, out)
-        match name:
-            case "PARAM_VALUE":
-                self._parameter(frame.fields(), out)
-            case "PARAM_ERROR":
-                self._parameter_error(frame.fields(), out)
-            case "HEARTBEAT":
-                pass
-            case _:
-                self._request(frame, out)
+        if name in REQUESTS:
+            self._request(frame, out)
+        elif name == "PARAM_VALUE":
+            self._parameter(frame.fields(), out)
+        elif name == "PARAM_ERROR":
+            self._parameter_error(frame.fields(), out)
         return out
 
     def tick(self, arrival_us: int) -> list[Effect]:
         """Let time pass up to this arrival stamp.  However often it is called, the outcome is the same."""
         out: list[Effect] = []
         self._now_us = arrival_us
-        for row in self.aligner.due(arrival_us):
-            self._row(row, out)
-        while (change := self.watch.silence(arrival_us)) is not None:
-            state, when_us = change
-            silent_s = (when_us - self.watch.heard_us) * 1e-6
-            text = f"no word from the vehicle for {silent_s:.0f} s"
-            self._tell(out, Event(Kind.LINK, state.value, Severity.WARNING, text), at_us=when_us)
-        if (ripe_us := self.watch.choose(arrival_us)) is not None:
-            self._found(ripe_us, out)
-        if self.watch.rivals and not self._rivals_told:
-            self._rivals_told = True
-            text = f"systems {', '.join(map(str, self.watch.rivals))} all fly; say which one with --sysid"
-            self._tell(out, Event(Kind.SELF, "config", Severity.ERROR, text), "several vehicles: give --sysid")
-        if self.watch.known:
-            out += self._ask_parameters(arrival_us)
+        watch = self.watch
+        # Called for every frame, and nearly always there is nothing to do: what is rare is asked here, before any call.
+        if arrival_us >= self.aligner.due_us:
+            for row in self.aligner.due(arrival_us):
+                self._row(row, out)
+        if arrival_us - watch.heard_us > SILENT_AFTER_US:
+            self._silence(arrival_us, out)
+        if watch.sysid is None:
+            self._choose(arrival_us, out)
+        if watch.sysid is not None:
+            if arrival_us >= self._parameters_due_us:
+                out += self._ask_parameters(arrival_us)
             for send in self._streams.tick(arrival_us):
                 out.append(self._to_vehicle(send))
             if self._streams.missing != self._missing_told:
@@ -192,6 +196,21 @@ class Core:
         return [*self.tick(arrival_us), self._heartbeat_of_ours(mavlink.MAV_STATE_POWEROFF)]
 
     # -- the vehicle ------------------------------------------------------------------------------------------------
+
+    def _silence(self, arrival_us: int, out: list[Effect]) -> None:
+        while (change := self.watch.silence(arrival_us)) is not None:
+            state, when_us = change
+            silent_s = (when_us - self.watch.heard_us) * 1e-6
+            text = f"no word from the vehicle for {silent_s:.0f} s"
+            self._tell(out, Event(Kind.LINK, state.value, Severity.WARNING, text), at_us=when_us)
+
+    def _choose(self, arrival_us: int, out: list[Effect]) -> None:
+        if (ripe_us := self.watch.choose(arrival_us)) is not None:
+            self._found(ripe_us, out)
+        if self.watch.rivals and not self._rivals_told:
+            self._rivals_told = True
+            text = f"systems {', '.join(map(str, self.watch.rivals))} all fly; say which one with --sysid"
+            self._tell(out, Event(Kind.SELF, "config", Severity.ERROR, text), "several vehicles: give --sysid")
 
     def _found(self, at_us: int, out: list[Effect]) -> None:
         watch = self.watch
@@ -267,10 +286,9 @@ class Core:
             self._tell(out, event, f"no {name} stream", at_us=self._streams.until_us)
 
     def _ask_parameters(self, arrival_us: int) -> list[Effect]:
-        if arrival_us < self._parameters_due_us or self._parameter_tries >= PARAMETER_TRIES:
+        if self._parameter_tries >= PARAMETER_TRIES or len(self.parameters) == len(self.airframe.detector.parameters):
+            self._parameters_due_us = NEVER_US  # all are known, or never will be: until a reboot
             return []
-        if len(self.parameters) == len(self.airframe.detector.parameters):
-            return []  # none but these are kept
         missing = [name for name in self.airframe.detector.parameters if name not in self.parameters]
         self._parameters_due_us = arrival_us + PARAMETERS_US
         self._parameter_tries += 1
@@ -317,7 +335,7 @@ class Core:
         self._row_t_us = None
 
     def _restart(self, row: GridRow, out: list[Effect]) -> None:
-        self.monitor = self.airframe.monitor()
+        self.monitor = self.airframe.monitor(compiler=self.compiler)
         if self.parameters:
             self.monitor.told(0, self.parameters)
         if row.restart is Restart.REBOOT:
@@ -343,6 +361,8 @@ class Core:
         return Finding(Phase(int(verdict.phase[0])), fault_id, float(verdict.confidence[0]))
 
     def _fault(self, fault_id: str | None) -> Fault | None:
+        if fault_id is None:
+            return None  # asked at every row
         return next((fault for fault in self.airframe.detector.faults if fault.id == fault_id), None)
 
     def _alarm(self, row: GridRow, verdict: Verdict, finding: Finding, out: list[Effect]) -> None:
@@ -477,20 +497,16 @@ class Core:
     # -- ourselves --------------------------------------------------------------------------------------------------
 
     def _request(self, frame: Frame, out: list[Effect]) -> None:
-        """What somebody asks of our own component."""
-        match frame.name:
-            case "TIMESYNC":
-                fields = frame.fields()
-                if fields["tc1"] == 0:
-                    out.append(Send("TIMESYNC", {"tc1": max(1, self._now_us * 1000), "ts1": fields["ts1"]}))
-            case "COMMAND_LONG" | "COMMAND_INT":
-                fields = frame.fields()
-                if self._addressed(fields):
-                    self._command(frame, fields, out)
-            case "PARAM_REQUEST_LIST" | "PARAM_REQUEST_READ" | "PARAM_SET":
-                fields = frame.fields()
-                if self._addressed(fields):
-                    self._own_parameter(frame, fields, out)
+        """What somebody asks of our own component: one of REQUESTS."""
+        name, fields = frame.name, frame.fields()
+        if name == "TIMESYNC":
+            if fields["tc1"] == 0:
+                out.append(Send("TIMESYNC", {"tc1": max(1, self._now_us * 1000), "ts1": fields["ts1"]}))
+        elif self._addressed(fields):
+            if name in ("COMMAND_LONG", "COMMAND_INT"):
+                self._command(frame, fields, out)
+            else:
+                self._own_parameter(frame, fields, out)
 
     def _addressed(self, fields: Mapping[str, Value]) -> bool:
         return fields["target_system"] == self.sysid and fields["target_component"] == self.compid

@@ -7,7 +7,6 @@ channel's name, and a row whose two units do not fit is refused when the table i
 
 import math
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, NamedTuple
@@ -143,8 +142,7 @@ class Sampled(NamedTuple):
     values: tuple[tuple[int, float], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Pick:
+class _Pick(NamedTuple):  # taken apart for every message
     position: int  # in the unpacked tuple
     channel: int
     factor: float
@@ -235,22 +233,22 @@ class Decoder:
                 continue
             stamp = flat[plan.clock_position] if plan.clock is not ClockKind.NONE else 0
             assert isinstance(stamp, int)  # every clock field is an integer on the wire
-            return Sampled(plan.clock, stamp, tuple(self._values(plan.picks, flat)))
+            return Sampled(plan.clock, stamp, self._values(plan.picks, flat))
         return None
 
-    def _values(self, picks: tuple[_Pick, ...], flat: tuple[int | float | bytes, ...]) -> Iterable[tuple[int, float]]:
-        for pick in picks:
-            raw = flat[pick.position]
+    def _values(self, picks: tuple[_Pick, ...], flat: tuple[int | float | bytes, ...]) -> tuple[tuple[int, float], ...]:
+        values: list[tuple[int, float]] = []
+        for position, channel, factor, unknown, mask, limit in picks:
+            raw = flat[position]
             assert not isinstance(raw, bytes)  # no row of the table names a text field
-            if raw == pick.unknown:
+            if raw == unknown:
                 continue
-            if pick.mask:
-                yield pick.channel, 1.0 if int(raw) & pick.mask else 0.0
+            if mask:
+                values.append((channel, 1.0 if int(raw) & mask else 0.0))
                 continue
-            value = raw * pick.factor
-            if not math.isfinite(value):
-                self.counts["not_finite"] += 1
-            elif abs(value) > pick.limit:
-                self.counts["absurd"] += 1
+            value = raw * factor
+            if -limit <= value <= limit:
+                values.append((channel, value))
             else:
-                yield pick.channel, value
+                self.counts["absurd" if math.isfinite(value) else "not_finite"] += 1
+        return tuple(values)

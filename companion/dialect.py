@@ -32,12 +32,14 @@ class Definition:
     id: int
     name: str
     crc_extra: int
+    seed: bytes  # crc_extra as the byte that ends what the CRC is taken over
     layout: struct.Struct
     fields: tuple[str, ...]  # in the order of the wire
     types: tuple[str, ...]  # "uint32_t", "char", ..., in the same order
     counts: tuple[int, ...]  # 0: a scalar, else an array of so many (a char array is one text)
     starts: tuple[int, ...]  # where the field begins in the unpacked tuple
     units: Mapping[str, str]  # wire units as MAVLink writes them: "cm/s", "degE7"
+    scalar: bool  # has it neither texts nor arrays?
 
     def unpack(self, payload: bytes) -> tuple[int | float | bytes, ...]:
         """Payload -> flat tuple.  MAVLink 2 cuts trailing zeros, newer definitions append fields: both are read."""
@@ -67,13 +69,21 @@ def definition(message_id: int) -> Definition | None:
         message.id,
         message.msgname,
         message.crc_extra,
+        bytes((message.crc_extra,)),
         message.unpacker,
         tuple(message.ordered_fieldnames),
         tuple(types[name] for name in message.ordered_fieldnames),
         tuple(counts),
         tuple(starts),
         dict(message.fieldunits_by_name),
+        not any(counts) and "char" not in types.values(),
     )
+
+
+def name_of(message_id: int) -> str:
+    """The name of a message id, UNKNOWN_<id> where the dialect does not know it."""
+    message = definition(message_id)
+    return message.name if message is not None else f"UNKNOWN_{message_id}"
 
 
 # Messages of MAVLink's common.xml (2026) that pymavlink's `all` dialect lacks, as PX4 sends them: id -> (name, CRC_EXTRA).
@@ -141,13 +151,15 @@ def encode(name: str, fields: Fields, *, sysid: int, compid: int, seq: int) -> b
             values.append(value)
     payload = message.layout.pack(*values).rstrip(b"\0") or b"\0"  # never empty: the protocol keeps the first byte
     head = struct.pack("<BBBBBBHB", len(payload), 0, 0, seq & 0xFF, sysid, compid, message.id & 0xFFFF, message.id >> 16)
-    crc = mcrf4xx(head + payload + bytes((message.crc_extra,)))
+    crc = mcrf4xx(head + payload + message.seed)
     return bytes((MAGIC_V2,)) + head + payload + struct.pack("<H", crc)
 
 
 def decode_fields(message: Definition, payload: bytes) -> dict[str, Value]:
     """All fields by name; char arrays as text up to their first NUL, other arrays as tuples."""
     flat = message.unpack(payload)
+    if message.scalar:
+        return dict(zip(message.fields, flat, strict=True))  # type: ignore[arg-type]  # no texts among them
     out: dict[str, Value] = {}
     for name, count, start in zip(message.fields, message.counts, message.starts, strict=True):
         value = flat[start]

@@ -7,13 +7,13 @@ checked; it is given out marked as such (to be recorded and forwarded, never bel
 from collections import Counter
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple
+from struct import Struct
+from typing import Final, NamedTuple, Protocol, overload
 
 from fastcrc.crc16 import mcrf4xx
 
 from companion.dialect import (
     CRC_BYTES,
-    HEADER_BYTES,
     LONGEST_FRAME_BYTES,
     MAGIC_V1,
     MAGIC_V2,
@@ -23,7 +23,10 @@ from companion.dialect import (
     Value,
     decode_fields,
     definition,
+    name_of,
 )
+
+_HEADER_V2: Final = Struct("<BBBBBBHB").unpack  # behind the magic byte
 
 
 class Frame(NamedTuple):
@@ -42,7 +45,7 @@ class Frame(NamedTuple):
 
     @property
     def name(self) -> str:
-        return self.definition.name if self.definition else f"UNKNOWN_{self.message_id}"
+        return self.definition.name if self.definition else name_of(self.message_id)
 
     @property
     def signed(self) -> bool:
@@ -65,40 +68,50 @@ class Check(Enum):
     UNKNOWN = "unknown"  # an id whose seed we do not know: it cannot be checked
 
 
-def candidate(data: bytes, start: int) -> tuple[Frame, Check] | None:
+class Octets(Protocol):
+    """Bytes at hand: `bytes`, or a file that is mapped."""
+
+    @overload
+    def __getitem__(self, place: int, /) -> int: ...
+    @overload
+    def __getitem__(self, place: slice, /) -> bytes: ...
+    def __len__(self) -> int: ...
+
+
+def candidate(data: Octets, start: int) -> tuple[Frame, Check] | None:
     """Look for a frame at `start`; None where none can begin.
 
     Raises IncompleteError if the bytes at hand end before the frame does.
     """
     magic = data[start]
-    if magic not in HEADER_BYTES:
-        return None
-    header = HEADER_BYTES[magic]
-    if len(data) < start + header:
-        raise IncompleteError
-    length = data[start + 1]
-    end = start + header + length + CRC_BYTES
     if magic == MAGIC_V2:
-        flags = data[start + 2]
+        body = start + 10
+        if len(data) < body:
+            raise IncompleteError
+        length, flags, _, seq, sysid, compid, low, high = _HEADER_V2(data[start + 1 : body])
         if flags & ~SIGNED:
             return None
-        seq, sysid, compid = data[start + 4], data[start + 5], data[start + 6]
-        message_id = data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
-        if flags & SIGNED:
-            end += SIGNATURE_BYTES
+        message_id = low | high << 16
+        stop = body + length
+        end = stop + CRC_BYTES + (SIGNATURE_BYTES if flags else 0)
+    elif magic == MAGIC_V1:
+        body = start + 6
+        if len(data) < body:
+            raise IncompleteError
+        length, seq, sysid, compid, message_id = data[start + 1 : body]
+        stop = body + length
+        end = stop + CRC_BYTES
     else:
-        seq, sysid, compid, message_id = data[start + 2], data[start + 3], data[start + 4], data[start + 5]
+        return None
     if len(data) < end:
         raise IncompleteError
-    body = start + header
     message = definition(message_id)
-    payload = data[body : body + length]
     check = Check.UNKNOWN
     if message is not None:
-        crc = data[body + length] | data[body + length + 1] << 8
-        fits = mcrf4xx(data[start + 1 : body + length] + bytes((message.crc_extra,))) == crc
-        check = Check.GOOD if fits else Check.BAD
-    return Frame(data[start:end], message_id, sysid, compid, seq, message, payload), check
+        crc = data[stop] | data[stop + 1] << 8
+        check = Check.GOOD if mcrf4xx(data[start + 1 : stop] + message.seed) == crc else Check.BAD
+    # Past the named tuple's own constructor, which takes half the time of all this again.
+    return tuple.__new__(Frame, (data[start:end], message_id, sysid, compid, seq, message, data[body:stop])), check
 
 
 @dataclass(slots=True)

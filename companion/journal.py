@@ -45,12 +45,11 @@ class Journal:
         """Note what these effects tell; -> the new lines."""
         new: list[dict[str, Json]] = []
         for effect in effects:
-            match effect:
-                case Judged(verdict=verdict):
-                    self.rows_judged += int(verdict.phase[0]) != Phase.WARMING
-                case Tell(event=event):
-                    new.append(self._line(event, sysid))
-                    self._note(event)
+            if isinstance(effect, Judged):
+                self.rows_judged += int(effect.verdict.phase[0]) != Phase.WARMING
+            elif isinstance(effect, Tell):
+                new.append(self._line(effect.event, sysid))
+                self._note(effect.event)
         return new
 
     @property

@@ -1,12 +1,12 @@
 """The walk over a log's bytes, compiled: where the frames are, and whether they may be believed.
 
-The rules are those of docs/logs.md.  `companion/tlog.py` walks by the same rules in plain Python, frame by frame, where
-numba is not installed; the tests hold the two against each other.  Kernels take bare arrays; names and units are one layer
-up, in `companion/columns.py`.
+The rules of the walk are those of docs/logs.md.  `companion/tlog.py` walks by the same rules in plain Python, frame by
+frame, where numba is not installed; the tests hold the two against each other.  What is in the frames is the subject of
+`companion/unpacking.py`.
 """
 
 from functools import cache
-from typing import Final
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numba import njit
@@ -27,6 +27,35 @@ IS_UNKNOWN: Final = 8
 RESYNCS, RESYNC_BYTES, TAIL_BYTES, CRC_FAILURES, GAPS, COUNTERS = 0, 1, 2, 3, 4, 5
 
 Bytes = NDArray[np.uint8]
+
+
+class Frames(NamedTuple):
+    """Where the frames of a log are, and what their headers say; each (frame,)."""
+
+    starts: NDArray[np.int64]  # of the magic byte
+    sizes: NDArray[np.uint16]  # of the whole frame, signature included
+    flags: NDArray[np.uint8]  # UNSTAMPED, IS_V2, IS_SIGNED, IS_UNKNOWN
+    ids: NDArray[np.int32]
+    sources: NDArray[np.uint16]  # sysid * 256 + compid
+    seqs: NDArray[np.uint8]
+    stamps_us: NDArray[np.uint64]  # with the link's bits; 0 where there is none
+
+    @classmethod
+    def empty(cls, count: int) -> Self:
+        """Room for so many."""
+        return cls(
+            starts=np.empty(count, np.int64),
+            sizes=np.empty(count, np.uint16),
+            flags=np.empty(count, np.uint8),
+            ids=np.empty(count, np.int32),
+            sources=np.empty(count, np.uint16),
+            seqs=np.empty(count, np.uint8),
+            stamps_us=np.empty(count, np.uint64),
+        )
+
+    def part(self, piece: slice) -> Self:
+        """Some of them, in the same memory."""
+        return type(self)._make(column[piece] for column in self)
 
 
 @cache
@@ -55,38 +84,74 @@ def seeds() -> NDArray[np.int16]:
 
 
 @njit(cache=True, inline="always")
+def word(data: Bytes, at: np.uint64) -> np.uint64:
+    """The eight bytes at `at`, the first lowest: one load, since the index is unsigned."""
+    found = np.uint64(0)
+    for k in range(8):
+        found |= np.uint64(data[at + np.uint64(k)]) << np.uint64(8 * k)
+    return found
+
+
+@njit(cache=True, inline="always")
+def stamp_at(data: Bytes, at: np.uint64) -> np.uint64:
+    """The eight bytes at `at`, the first highest."""
+    found = np.uint64(0)
+    for k in range(8):
+        found = found << np.uint64(8) | np.uint64(data[at + np.uint64(k)])
+    return found
+
+
+@njit(cache=True, inline="always")
+def crc_step(state: np.uint64, eight: np.uint64, tables: NDArray[np.uint16]) -> np.uint64:
+    """The CRC state behind eight more bytes, the first lowest."""
+    mixed, crc = state ^ eight, np.uint16(0)
+    for k in range(8):
+        crc ^= tables[np.uint64(1792 - 256 * k) + (mixed >> np.uint64(8 * k) & np.uint64(0xFF))]
+    return np.uint64(crc)
+
+
+@njit(cache=True, inline="always")
+def crc_byte(state: np.uint64, byte: np.uint64, tables: NDArray[np.uint16]) -> np.uint64:
+    """The CRC state behind one more byte."""
+    return state >> np.uint64(8) ^ np.uint64(tables[(state ^ byte) & np.uint64(0xFF)])
+
+
+@njit(cache=True, inline="always")
+def crc_begun(odd: np.uint64, eight: np.uint64, tables: NDArray[np.uint16]) -> np.uint64:
+    """The CRC state behind the first `odd` bytes, 1 to 7, the last of the eight; what stands before them does not matter.
+
+    They are put behind zeros, which leave a state of zero alone.  The state at the begin, 0xFFFF, is then the same as their
+    first two bytes turned over; where there is one byte alone, the other half stays in the state.
+    """
+    zeros = np.uint64(8) * (np.uint64(8) - odd)
+    crc = crc_step(np.uint64(0), eight >> zeros << zeros ^ np.uint64(0xFFFF) << zeros, tables)
+    return np.uint64(crc ^ np.uint64(0xFF) if odd == np.uint64(1) else crc)
+
+
+@njit(cache=True, inline="always")
+def crc_words(crc: np.uint64, data: Bytes, at: np.uint64, stop: np.uint64, tables: NDArray[np.uint16]) -> np.uint64:
+    """The CRC state behind data[at:stop], whole words of eight bytes."""
+    while at < stop:
+        crc = crc_step(crc, word(data, at), tables)
+        at += np.uint64(8)
+    return crc
+
+
+@njit(cache=True)
 def crc16(data: Bytes, start: int, end: int, seed: np.uint64, tables: NDArray[np.uint16]) -> np.uint64:
-    """CRC-16/MCRF4XX over data[start:end] and the seed byte behind it: eight bytes at a time, then four, two, one.
+    """CRC-16/MCRF4XX over data[start:end] and the seed byte behind it: the odd bytes first, then eight at a time.
 
     Unsigned all through: a signed index would cost a test for negative ones at each look-up.
     """
-    eight, low = np.uint64(8), np.uint64(0xFF)
-    crc = np.uint64(0xFFFF)
-    at = start
-    while end - at >= 8:
-        first, second = np.uint64(data[at]) ^ (crc & low), np.uint64(data[at + 1]) ^ (crc >> eight)
-        crc = np.uint64(
-            tables[1792 + first]
-            ^ tables[1536 + second]
-            ^ tables[1280 + data[at + 2]]
-            ^ tables[1024 + data[at + 3]]
-            ^ tables[768 + data[at + 4]]
-            ^ tables[512 + data[at + 5]]
-            ^ tables[256 + data[at + 6]]
-            ^ tables[data[at + 7]]
-        )
-        at += 8
-    if end - at >= 4:
-        first, second = np.uint64(data[at]) ^ (crc & low), np.uint64(data[at + 1]) ^ (crc >> eight)
-        crc = np.uint64(tables[768 + first] ^ tables[512 + second] ^ tables[256 + data[at + 2]] ^ tables[data[at + 3]])
-        at += 4
-    if end - at >= 2:
-        first, second = np.uint64(data[at]) ^ (crc & low), np.uint64(data[at + 1]) ^ (crc >> eight)
-        crc = np.uint64(tables[256 + first] ^ tables[second])
-        at += 2
-    if at < end:
-        crc = (crc >> eight) ^ np.uint64(tables[(crc ^ np.uint64(data[at])) & low])
-    return (crc >> eight) ^ np.uint64(tables[(crc ^ seed) & low])
+    crc, at, stop = np.uint64(0xFFFF), np.uint64(start), np.uint64(end)
+    odd = (stop - at) & np.uint64(7)
+    if odd and at >= np.uint64(8):
+        crc = crc_begun(odd, word(data, at + odd - np.uint64(8)), tables)
+        at += odd
+    while (stop - at) & np.uint64(7):
+        crc = crc_byte(crc, np.uint64(data[at]), tables)
+        at += np.uint64(1)
+    return np.uint64(crc_byte(crc_words(crc, data, at, stop, tables), seed, tables))
 
 
 @njit(cache=True)
@@ -118,10 +183,6 @@ def candidate(data: Bytes, q: int, n: int, extras: NDArray[np.int16], tables: ND
     if np.int64(crc) == np.int64(data[body + length]) | np.int64(data[body + length + 1]) << 8:
         return GOOD, end
     return BAD, end
-
-
-# The walk's first look at each place is nearly every look: a copy of its own, so that it is compiled into the loop.
-first_candidate = njit(inline="always")(candidate.py_func)
 
 
 @njit(cache=True)
@@ -191,34 +252,98 @@ def find_again(
 
 
 @njit(cache=True)
+def good_frames(
+    data: Bytes,
+    position: int,
+    count: int,
+    extras: NDArray[np.int16],
+    tables: NDArray[np.uint16],
+    frames: Frames,
+) -> tuple[int, int]:
+    """Stamped good frames, one behind the other, up to the first place that is anything else: (frames, position there).
+
+    count: frames that `frames` holds already.  What stops here is judged by `walk`.  Nearly all of a log is good
+    frames, and with the other cases in the same loop they take four times as long.  The CRC takes whole words of eight
+    bytes, since steps of four, two and one are branches that no processor foresees; those before the odd ones at its begin
+    are the stamp's.
+    """
+    one, eight = np.uint64(1), np.uint64(8)
+    n, known = np.uint64(data.shape[0]), np.uint64(extras.shape[0])
+    at, f, room = np.uint64(position), np.uint64(count), np.uint64(frames.starts.shape[0])
+    while at + np.uint64(20) <= n and f < room:
+        q = at + eight
+        magic = data[q]
+        length = np.uint64(data[q + one])
+        flag, signature = np.uint8(0), np.uint64(0)
+        if magic == 0xFD:
+            flag = np.uint8(IS_V2)
+            if data[q + np.uint64(2)]:
+                if data[q + np.uint64(2)] != 1:
+                    break
+                flag, signature = np.uint8(IS_V2 | IS_SIGNED), np.uint64(13)
+            message_id = np.uint64(data[q + np.uint64(7)])
+            message_id |= np.uint64(data[q + eight]) << eight | np.uint64(data[q + np.uint64(9)]) << np.uint64(16)
+            checked = length + np.uint64(9)
+            sender = q + np.uint64(4)
+        elif magic == 0xFE:
+            message_id = np.uint64(data[q + np.uint64(5)])
+            checked = length + np.uint64(5)
+            sender = q + np.uint64(2)
+        else:
+            break
+        body_end = q + one + checked
+        end = body_end + np.uint64(2) + signature
+        if end > n or message_id >= known or extras[message_id] < 0:
+            break
+        odd = checked & np.uint64(7)
+        whole = q + one + odd
+        crc = np.uint64(0xFFFF)
+        if odd:
+            crc = crc_begun(odd, word(data, whole - eight), tables)
+        crc = crc_byte(crc_words(crc, data, whole, body_end, tables), np.uint64(extras[message_id]), tables)
+        if crc != np.uint64(data[body_end]) | np.uint64(data[body_end + one]) << eight:
+            break
+        frames.starts[f] = q
+        frames.sizes[f] = end - q
+        frames.flags[f] = flag
+        frames.ids[f] = message_id
+        frames.sources[f] = np.uint16(data[sender + one]) << np.uint16(8) | np.uint16(data[sender + np.uint64(2)])
+        frames.seqs[f] = data[sender]
+        frames.stamps_us[f] = stamp_at(data, at)
+        f += one
+        at = end
+    return int(np.int64(f)), int(np.int64(at))
+
+
+@njit(cache=True)
 def walk(
     data: Bytes,
     position: int,
     extras: NDArray[np.int16],
     tables: NDArray[np.uint16],
-    starts: NDArray[np.int64],
-    sizes: NDArray[np.uint16],
-    flags: NDArray[np.uint8],
-    ids: NDArray[np.int32],
-    sources: NDArray[np.uint16],
-    seqs: NDArray[np.uint8],
-    stamps_us: NDArray[np.uint64],
+    frames: Frames,
     counters: NDArray[np.int64],
     failed_ids: NDArray[np.int64],
     skips: NDArray[np.int64],
 ) -> tuple[int, int]:
     """Frames from `position` on, as many as the arrays hold: (frames, position to go on from).
 
-    starts to stamps_us: (frame,), filled; see `columns.Index`.  counters: (COUNTERS,), added to.  failed_ids, skips: ids of
-    CRC failures, and (offset, length) in turn of skipped bytes, from the first of the log on, as many as fit.
+    frames: filled.  counters: (COUNTERS,), added to.  failed_ids, skips: ids of CRC failures, and
+    (offset, length) in turn of skipped bytes, from the first of the log on, as many as fit.
     """
     n = data.shape[0]
-    count, room = 0, starts.shape[0]
-    while position >= 0 and position < n and count < room:  # said to be positive: spares a test at each look-up
+    count, room = 0, frames.starts.shape[0]
+    good = True  # so was the last frame, and stamped; behind any other the call would not pay: some logs have no stamps
+    while True:
+        if good:
+            count, position = good_frames(data, position, count, extras, tables, frames)
+        if position >= n or count >= room:
+            break
         start = position + 8
         flag = 0
-        status, end = first_candidate(data, start, n, extras, tables)
-        if status != GOOD:
+        status, end = candidate(data, start, n, extras, tables)
+        good = status == GOOD
+        if not good:
             if status == UNKNOWN and confirmed(data, end, n, extras, tables):
                 flag = IS_UNKNOWN
             else:
@@ -226,75 +351,22 @@ def walk(
                 if start >= n:
                     position = n
                     break
+        sender = start + 2
         if data[start] == 0xFD:
+            sender = start + 4
             flag |= IS_V2
             if data[start + 2] & 1:
                 flag |= IS_SIGNED
-            seqs[count] = data[start + 4]
-            sources[count] = np.uint16(data[start + 5]) << np.uint16(8) | np.uint16(data[start + 6])
-        else:
-            seqs[count] = data[start + 2]
-            sources[count] = np.uint16(data[start + 3]) << np.uint16(8) | np.uint16(data[start + 4])
-        stamp = np.uint64(0)
-        if not flag & UNSTAMPED:
-            for k in range(start - 8, start):
-                stamp = stamp << np.uint64(8) | np.uint64(data[k])
-        starts[count] = start
-        sizes[count] = end - start
-        flags[count] = flag
-        ids[count] = message_id_at(data, start)
-        stamps_us[count] = stamp
+        frames.starts[count] = start
+        frames.sizes[count] = end - start
+        frames.flags[count] = flag
+        frames.ids[count] = message_id_at(data, start)
+        frames.sources[count] = np.uint16(data[sender + 1]) << np.uint16(8) | np.uint16(data[sender + 2])
+        frames.seqs[count] = data[sender]
+        frames.stamps_us[count] = np.uint64(0) if flag & UNSTAMPED else stamp_at(data, np.uint64(start - 8))
         count += 1
         position = end
     return count, position
-
-
-@njit(cache=True)
-def spread(
-    data: Bytes,
-    first: int,
-    starts: NDArray[np.int64],
-    ids: NDArray[np.int32],
-    sources: NDArray[np.uint16],
-    stamps_us: NDArray[np.uint64],
-    chosen: NDArray[np.bool_],
-    sizes: NDArray[np.int64],
-    next_byte: NDArray[np.int64],
-    next_row: NDArray[np.int64],
-    payloads: Bytes,
-    row_frames: NDArray[np.int64],
-    row_stamps_us: NDArray[np.uint64],
-    row_sysids: NDArray[np.uint8],
-    row_compids: NDArray[np.uint8],
-) -> None:
-    """Payloads of the chosen frames, type by type, cut or filled with zeros to the size of the definition.
-
-    first: number of the first frame given.  starts to chosen: (frame,).  sizes: by message id; next_byte, next_row: by
-    message id, where its next payload and its next row go, both moved on.  payloads: flat bytes, row_*: flat by row, all
-    filled; stamps without the link's bits.  One pass in the order of the file: gathering type by type goes through memory
-    once a type, and takes ten times as long.
-    """
-    for f in range(starts.shape[0]):
-        if not chosen[f]:
-            continue
-        q = starts[f]
-        body = q + 10 if data[q] == 0xFD else q + 6
-        message_id = ids[f]
-        size = sizes[message_id]
-        length = min(np.int64(data[q + 1]), size)
-        to = next_byte[message_id]
-        next_byte[message_id] = to + size
-        row = next_row[message_id]
-        next_row[message_id] = row + 1
-        row_frames[row] = first + f
-        row_stamps_us[row] = stamps_us[f] & ~np.uint64(3)
-        row_sysids[row] = sources[f] >> np.uint16(8)
-        row_compids[row] = sources[f] & np.uint16(0xFF)
-        source, target = data[body : body + length], payloads[to : to + length]
-        for k in range(length):
-            target[k] = source[k]
-        for k in range(to + length, to + size):
-            payloads[k] = 0
 
 
 @njit(cache=True)

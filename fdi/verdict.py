@@ -59,7 +59,10 @@ class Verdict:
 
 
 class Monitor(Protocol):
-    """What `fdi/<airframe>.py` offers under the name `Monitor`: built as `Monitor(config, flights=n)`."""
+    """What `fdi/<airframe>.py` offers under the name `Monitor`: built as `Monitor(config, flights=n, compiler=None)`.
+
+    compiler: makes machine code of kernels (fdi/kernel.py); a monitor that has none takes no notice of it.
+    """
 
     @property
     def state(self) -> dict[str, NDArray[np.float64]]:

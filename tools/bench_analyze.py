@@ -2,24 +2,30 @@
 
 The log is one of our own simulator, made in one process: a ten-minute flight with every stream at its fast rate, both
 directions, crossed lines included.  The first child warms numba's cache and the file's pages and does not count; then
-the median of several.  `--profile` runs once more under cProfile and prints where the time went, `--imports` prints the
-slowest imports.
+the median of several.  `--parts` times reading, checks and replay one by one in this process, the best of three;
+`--profile` runs once more under cProfile and prints where the time went, `--imports` prints the slowest imports.
 
     python tools/bench_analyze.py
 """
 
 import argparse
+import gc
 import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from companion import airframe as airframes
+from companion.analysis import Replay
+from companion.checks import Bench
 from companion.decision import Policy
 from companion.rehearsal import Rehearsal
+from companion.tlog import Reader
 from sitl.autopilot import Autopilot
 from sitl.vehicle import parse_fault
 
@@ -60,12 +66,43 @@ def child(words: list[str]) -> tuple[float, bytes]:
         return usage.ru_utime + usage.ru_stime, out.read()
 
 
+def parts_s(log: Path) -> dict[str, float]:
+    """CPU seconds of the parts of one analysis of our own flight, the monitor's within the replay's; imports not counted."""
+    airframe = airframes.load("parafoil")
+    records = list(Reader(log))
+
+    def check() -> None:
+        bench = Bench()
+        for stamp_us, frame in records:
+            bench.take(frame, stamp_us)
+        bench.finish()
+
+    def replay() -> None:
+        again = Replay(airframe)
+        for record in records:
+            again.take(record)
+
+    return {"reading": best_s(lambda: list(Reader(log))), "checks": best_s(check), "replay": best_s(replay)}
+
+
+def best_s(work: Callable[[], object]) -> float:
+    spent_s = []
+    gc.disable()  # as `analyze` does it
+    for _ in range(3):
+        before_s = time.process_time()
+        work()
+        spent_s.append(time.process_time() - before_s)
+    gc.enable()
+    return min(spent_s)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else "")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--log", type=Path, help="this log instead of a flight of our own; it must hold a fault")
+    parser.add_argument("--parts", action="store_true", help="print what reading, checks and replay cost")
     parser.add_argument("--profile", action="store_true", help="print where the time goes, by cProfile")
     parser.add_argument("--imports", action="store_true", help="print the slowest imports")
     args = parser.parse_args()
@@ -82,6 +119,9 @@ def main() -> None:
         print(f"log        {messages} messages, {content['duration_s']:.0f} s, {content['log']['bytes'] / 1e6:.1f} MB")
         print(f"analyze    {median_s:.2f} s of CPU, {min(spent_s):.2f} to {max(spent_s):.2f} in {args.runs} runs {bar}")
         print(f"           {1e6 * median_s / messages:.1f} us a message, start included")
+        if args.parts:
+            for name, part_s in parts_s(log).items():
+                print(f"{name:10} {part_s:.2f} s")
         if args.profile:
             _, said = child(["-c", PROFILED, *COMMAND[2:], str(log)])
             print("\n".join(said.decode().splitlines()[1:60]))

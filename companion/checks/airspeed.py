@@ -6,16 +6,15 @@ from typing import Final
 
 import numpy as np
 
-from companion.checks.finding import Check, Held, Result, Span, absent, fine, found, median, number, total_s
+from companion.checks.finding import HOLD_S, Check, Held, Result, absent, fine, found, median, number, runs, total_s
 from companion.checks.flight import Flight
-from companion.checks.gps import FIX_3D, UINT16_MAX
+from companion.checks.reading import FIX_3D, PITCH_AND_YAW, UINT16_MAX
 from companion.checks.series import Series, between, sliding, unwrapped
 from companion.dialect import Fields
 from companion.frames import Frame
 
 WORKED_M_S: Final = 5.0  # a sensor that never read so much is none
 GROUND_M_S: Final = 10.0  # the ground speed at which no airspeed can be next to nothing but in a gale
-HOLD_S: Final = 5.0
 SAME_M_S: Final = 0.005
 CHANGED_M_S: Final = 1.0
 STUCK_SAMPLES: Final = 10
@@ -129,14 +128,11 @@ class Scale:
     flight: Flight
     _sensor: _Sensor = field(default_factory=_Sensor)
     _air: Series = field(default_factory=Series)
-    _attitude: Series = field(default_factory=Series)
     _ground: Series = field(default_factory=Series)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         boot = self.flight.boot
-        if name == "ATTITUDE":
-            self._attitude.take(boot, (t_s, number(fields, "pitch"), number(fields, "yaw")))
-        elif name == "GPS_RAW_INT":
+        if name == "GPS_RAW_INT":
             speed, course = number(fields, "vel"), number(fields, "cog")
             if number(fields, "fix_type") >= FIX_3D and UINT16_MAX not in (speed, course):
                 course_rad = math.radians(course / 100.0)
@@ -157,18 +153,12 @@ class Scale:
         if len(windows) < REFERENCES + 2:
             return absent("no airspeed with GPS velocity and attitude through enough turns")
         reference = median([scale for _, scale, _ in windows[:REFERENCES]])
-        worst = 0.0
-        spans: list[Span] = []
-        standing: list[float] = []
-        for end_s, scale, error in [*windows[REFERENCES:], (math.inf, math.nan, 0.0)]:
-            away = scale / reference - 1.0
-            if abs(away) > max(self.check.limit, 5.0 * error / reference):
-                standing.append(end_s)
-                worst = away if abs(away) > abs(worst) else worst
-                continue
-            if len(standing) >= 2:
-                spans.append((standing[0] - HOP_S, standing[-1]))
-            standing.clear()
+        away = [scale / reference - 1.0 for _, scale, _ in windows[REFERENCES:]]
+        errors = [error / reference for _, _, error in windows[REFERENCES:]]
+        beyond = [abs(part) > max(self.check.limit, 5.0 * error) for part, error in zip(away, errors, strict=True)]
+        worst = max((part for part, stands in zip(away, beyond, strict=True) if stands), key=abs, default=0.0)
+        ends_s = [end_s for end_s, _, _ in windows[REFERENCES:]]
+        spans = [(ends_s[first] - HOP_S, ends_s[last]) for first, last in runs(beyond, 2)]
         if spans:
             return found(self.check, f"reads {100.0 * (1.0 / (1.0 + worst) - 1.0):+.0f} % against before", tuple(spans))
         return fine("agrees with ground speed and heading")
@@ -177,7 +167,7 @@ class Scale:
         """(end of window, k, its standard error) where the turns tell k from the wind."""
         air = self._air.table(boot)
         t_s = air[:, 0]
-        attitude = between(t_s, unwrapped(self._attitude.table(boot), -1), GAP_S)
+        attitude = between(t_s, unwrapped(self.flight.attitude.table(boot, PITCH_AND_YAW), -1), GAP_S)
         ground = between(t_s, self._ground.table(boot), GAP_S)
         if attitude.shape[1] != 2 or ground.shape[1] != 2:
             return []

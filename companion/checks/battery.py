@@ -7,13 +7,13 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from companion.checks.finding import Check, Held, Result, Status, absent, fine, found, known, number, total_s
+from companion.checks.finding import Check, Excess, Held, Result, Status, absent, fine, found, known, number
 from companion.checks.flight import Flight
+from companion.checks.level import Level
+from companion.checks.reading import UINT16_MAX
 from companion.dialect import Fields
 from companion.frames import Frame
 
-HOLD_S: Final = 5.0
-UINT16_MAX: Final = 65535.0
 CHARGE_STATES: Final = {
     mavlink.MAV_BATTERY_CHARGE_STATE_LOW: "low",
     mavlink.MAV_BATTERY_CHARGE_STATE_CRITICAL: "critical",
@@ -27,6 +27,7 @@ SOUND_CELL_V: Final = 3.6  # a cell that begins below is of another chemistry, o
 LEAST_V: Final = 3.0
 SETTLE_S: Final = 4.0  # length of either mean
 APART_S: Final = 6.0  # between them
+RAIL_HOLD_S: Final = 0.5
 STEADY_A: Final = 2.0
 STEADY: Final = 0.10  # a current that grew by less than this part and by less than STEADY_A explains no sag
 
@@ -43,14 +44,16 @@ class Charge:
 
     check: Check
     flight: Flight
-    _held: Held = field(default_factory=lambda: Held(HOLD_S))
-    _least: float = math.inf
+    _left: Excess = field(init=False)
     _states: list[str] = field(default_factory=list)
     _sound: bool = False  # it said OK before: what never did may just not be connected
 
+    def __post_init__(self) -> None:
+        self._left = Excess(self.check.limit, below=True)
+
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         if not self.flight.armed:
-            self._held.stop()
+            self._left.take(t_s, math.nan)
             return
         if name == "BATTERY_STATUS":
             value = int(number(fields, "charge_state"))
@@ -61,19 +64,18 @@ class Charge:
             return
         left = number(fields, "battery_remaining")
         if 0.0 <= left <= 100.0 and not math.isnan(pack_v(fields)):
-            self._least = min(self._least, left)
-            self._held.take(t_s, left < self.check.limit)
+            self._left.take(t_s, left)
 
     def finish(self) -> Result:
-        if not self._held.samples and not self._states:
+        if not self._left.samples and not self._states:
             return absent("the battery's charge is not told while armed")
-        spans = self._held.spans()
-        parts = [f"down to {self._least:.0f} %"] if spans else []
+        spans = self._left.spans()
+        parts = [f"down to {self._left.farthest:.0f} %"] if spans else []
         parts += [f"battery says {state}" for state in self._states]
         if parts:
             broken = self._sound and any(state in BROKEN for state in self._states)
             return found(self.check, ", ".join(parts), spans, Status.FAULT if broken else Status.WARNING)
-        return fine(f"{self._least:.0f} % or more")
+        return fine(f"{self._left.farthest:.0f} % or more")
 
 
 @dataclass(slots=True)
@@ -82,7 +84,6 @@ class Cells:
 
     check: Check
     flight: Flight
-    _held: Held = field(default_factory=lambda: Held(HOLD_S))
     _samples: list[tuple[float, float]] = field(default_factory=list)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
@@ -98,14 +99,11 @@ class Cells:
         cells = math.ceil(high_v / FULL_CELL_V)
         if high_v / cells < SOUND_CELL_V:
             return absent(f"{high_v:.1f} V tells no number of lithium cells")
+        cell_v = Excess(self.check.limit, below=True)
         for t_s, volts in self._samples:
-            self._held.take(t_s, volts / cells < self.check.limit, self.check.limit - volts / cells)
-        least_v = min(volts for _, volts in self._samples) / cells
-        spans = self._held.spans()
-        if spans:
-            told = f"{self.check.limit - self._held.worst:.2f} V a cell of {cells}, {total_s(spans):.0f} s in all"
-            return found(self.check, told, spans)
-        return fine(f"{least_v:.2f} V a cell of {cells} or more")
+            cell_v.take(t_s, volts / cells)
+        beyond = f"{{worst:.2f}} V a cell of {cells}, {{lasted_s:.0f}} s in all"
+        return cell_v.result(self.check, "", beyond, f"{{farthest:.2f}} V a cell of {cells} or more")
 
 
 @dataclass(slots=True)
@@ -155,27 +153,12 @@ def _mean(samples: list[tuple[float, float, float]], place: int) -> float:
     return math.fsum(sample[place] for sample in samples) / len(samples)
 
 
-@dataclass(slots=True)
-class Rail:
+def rail(check: Check, flight: Flight) -> Level:
     """Check `power_rail`: the autopilot's own 5 V supply while armed."""
 
-    check: Check
-    flight: Flight
-    _held: Held = field(default_factory=lambda: Held(0.5))
-    _least_v: float = math.inf
-
-    def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+    def read(fields: Fields) -> float:
         volts = known(number(fields, "Vcc"), UINT16_MAX) / 1e3
-        if not self.flight.armed or not volts > 1.0:
-            self._held.stop()
-            return
-        self._least_v = min(self._least_v, volts)
-        self._held.take(t_s, volts < self.check.limit)
+        return volts if volts > 1.0 else math.nan
 
-    def finish(self) -> Result:
-        if not self._held.samples:
-            return absent("the autopilot's supply is not told while armed")
-        spans = self._held.spans()
-        return (
-            found(self.check, f"down to {self._least_v:.2f} V", spans) if spans else fine(f"{self._least_v:.2f} V or more")
-        )
+    words = ("the autopilot's supply is not told while armed", "down to {farthest:.2f} V", "{farthest:.2f} V or more")
+    return Level(check, flight, read, *words, below=True, hold_s=RAIL_HOLD_S)

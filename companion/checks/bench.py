@@ -5,40 +5,27 @@ that is asked for; of all others only what they do to the link.
 """
 
 import math
-from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from companion.checks.bootclock import BootClock, Clocks, Reboots
-from companion.checks.finding import EVERY_FRAME, Check, Finding, Result, Status, Unit, absent, number
+from companion.checks.finding import EVERY_BEAT, EVERY_FRAME, Check, Finding, Result, Status, Unit, absent, number
 from companion.checks.flight import Flight
+from companion.checks.reading import INSTANCES, NONE, Steps, attitude, imu
 from companion.checks.table import CLOCK, REBOOT, ROWS
-from companion.dialect import Definition, Fields, definition
+from companion.dialect import Definition, Fields, by_name, decode_fields
 from companion.frames import Frame
 from companion.vehicle import NO_VEHICLE
 
 WAIT_FRAMES: Final = 5000  # for an autopilot and its clock, before the rest is judged without
 WAIT_S: Final = 10.0
 NOTHING: Final[Fields] = {}
+HEARTBEAT_ID: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 
-# Messages that the bench itself reads, needed by a check or not.
-OWN: Final = frozenset({"HEARTBEAT", "SYSTEM_TIME", "VFR_HUD", "GLOBAL_POSITION_INT", "EXTENDED_SYS_STATE"})
-
-
-@cache
-def _plain(message_id: int) -> bool:
-    message = definition(message_id)
-    return message is not None and not any(message.counts) and "char" not in message.types
-
-
-def _fields(frame: Frame, message: Definition) -> Fields:
-    """Frame.fields, with a shorter way for messages of scalars only."""
-    if _plain(message.id):
-        return dict(zip(message.fields, message.unpack(frame.payload), strict=True))  # type: ignore[arg-type]  # no texts
-    return frame.fields()
+Take = Callable[[str, Fields, float, Frame], None]
 
 
 @dataclass(slots=True)
@@ -57,14 +44,28 @@ class Bench:
     flight: Flight = field(default_factory=Flight)
     clock: BootClock = field(default_factory=BootClock)
     _units: list[tuple[Check, Unit]] = field(default_factory=list)
-    _every: list[Unit] = field(default_factory=list)
-    _needed: dict[str, list[Unit]] = field(default_factory=lambda: defaultdict(list))
-    _heard: set[str] = field(default_factory=set)
+    _every: list[Take] = field(default_factory=list)
+    _beats: list[Take] = field(default_factory=list)
+    _wanted: dict[int, list[Take]] = field(default_factory=dict)  # by message id, of the vehicle's autopilot
+    _heard: set[int] = field(default_factory=set)
     _waiting: list[tuple[Frame, float]] | None = field(default_factory=list)
     _waiting_since_s: float = math.nan
     _arrival_s: float = math.nan
+    _steps: Steps = field(default_factory=Steps)
 
     def __post_init__(self) -> None:
+        # What all checks share is read first, of these messages even if no check needs them.
+        shared: dict[str, Take] = {
+            "HEARTBEAT": self._beat,
+            "VFR_HUD": self._speed,
+            "GLOBAL_POSITION_INT": self._height,
+            "EXTENDED_SYS_STATE": self._landed,
+            "GPS_RAW_INT": self._step,
+            "ATTITUDE": self._attitude,
+            **dict.fromkeys((*INSTANCES, "HIGHRES_IMU"), self._imu),
+        }
+        self._wanted = {by_name(name).id: [take] for name, take in shared.items()}
+        self._wanted[by_name("SYSTEM_TIME").id] = []  # for the clock alone
         for check, build in ROWS:
             self._add(check, build(check, self.flight))
         self._add(REBOOT, Reboots(REBOOT, self.flight, self.clock))
@@ -73,12 +74,12 @@ class Bench:
     def _add(self, check: Check, unit: Unit) -> None:
         self._units.append((check, unit))
         if EVERY_FRAME in check.needs:
-            self._every.append(unit)
-            return
-        for names in (*check.needs, *check.also):
-            for name in names.split("|"):
-                if not any(unit is other for other in self._needed[name]):
-                    self._needed[name].append(unit)
+            self._every.append(unit.take)
+        elif EVERY_BEAT in check.needs:
+            self._beats.append(unit.take)
+        else:
+            for name in dict.fromkeys(name for names in (*check.needs, *check.also) for name in names.split("|")):
+                self._wanted.setdefault(by_name(name).id, []).append(unit.take)
 
     def take(self, frame: Frame, arrival_us: int | None) -> None:
         """The next frame of the log.  arrival_us: its stamp, None where it has none (or no plausible one)."""
@@ -88,14 +89,19 @@ class Bench:
             self._arrival_s = arrival_us / 1e6
         if self._waiting is None:
             self._judge(frame, self._arrival_s)
-            return
+        else:
+            self._keep(frame, frame.definition)
+
+    def _keep(self, frame: Frame, message: Definition) -> None:
+        """Nothing is judged before the vehicle and its clock are known."""
+        assert self._waiting is not None  # else it would be judged
         self._waiting.append((frame, self._arrival_s))
-        if self.flight.sysid is None and frame.name == "HEARTBEAT":
+        if self.flight.sysid is None and frame.message_id == HEARTBEAT_ID:
             self._offer(frame)
         if math.isnan(self._waiting_since_s):
             self._waiting_since_s = self._arrival_s
         own = (frame.sysid, frame.compid) == (self.flight.sysid, self.flight.compid)
-        clocked = own and "time_boot_ms" in frame.definition.fields
+        clocked = own and "time_boot_ms" in message.fields
         late = len(self._waiting) >= WAIT_FRAMES or abs(self._arrival_s - self._waiting_since_s) > WAIT_S
         if clocked or late:
             self._release()
@@ -123,44 +129,61 @@ class Bench:
             self._judge(frame, arrival_s)
 
     def _judge(self, frame: Frame, arrival_s: float) -> None:
-        flight = self.flight
+        flight, clock = self.flight, self.clock
         message = frame.definition
         assert message is not None  # `take` lets no other in
-        name = message.name
+        name, message_id = message.name, message.id
         flight.arrival_s = arrival_s
-        if flight.sysid is None and name == "HEARTBEAT":
+        if flight.sysid is None and message_id == HEARTBEAT_ID:
             self._offer(frame)
-        ours = frame.sysid == flight.sysid and frame.compid == flight.compid
-        units = self._needed.get(name) if ours else None
-        fields = NOTHING
-        if units is not None or (ours and name in OWN):
-            fields = _fields(frame, message)
-            self._heard.add(name)
-        flight.t_s = t_s = self.clock.take(fields, arrival_s, flight.armed) if ours else self._time(arrival_s)
-        flight.clocked = self.clock.started
-        flight.boot = len(self.clock.jumps)
-        if fields and name in OWN:
-            self._own(name, fields)
-        for unit in self._every:
-            unit.take(name, NOTHING, t_s, frame)
-        for unit in units or ():
-            unit.take(name, fields, t_s, frame)
+        ours = frame.compid == flight.compid and frame.sysid == flight.sysid
+        clock.arrive(arrival_s)
+        takes = self._wanted.get(message_id) if ours else None
+        if takes is None:  # nothing in it is looked at
+            flight.t_s = t_s = clock.now_s()
+        else:
+            self._heard.add(message_id)
+            fields = decode_fields(message, frame.payload)
+            flight.t_s = t_s = clock.read(fields, flight.armed)
+            flight.clocked = clock.started
+            flight.boot = len(clock.jumps)
+            for take in takes:
+                take(name, fields, t_s, frame)
+        for take in self._every:
+            take(name, NOTHING, t_s, frame)
+        if message_id == HEARTBEAT_ID:
+            for take in self._beats:
+                take(name, NOTHING, t_s, frame)
 
-    def _time(self, arrival_s: float) -> float:
-        """The vehicle's clock when somebody else speaks."""
-        return self.clock.take(NOTHING, arrival_s, self.flight.armed)
+    def _beat(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        if number(fields, "autopilot") == self.flight.autopilot and number(fields, "type") == self.flight.type:
+            self.flight.beat(fields)  # a beat of another kind under the same id is not the vehicle's
+            self.flight.move()
 
-    def _own(self, name: str, fields: Fields) -> None:
+    def _speed(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        self.flight.ground_speed_m_s = number(fields, "groundspeed")
+        self.flight.move()
+
+    def _height(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        self.flight.height_m = number(fields, "relative_alt") / 1e3
+        self.flight.move()
+
+    def _landed(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        self.flight.landed_state = int(number(fields, "landed_state"))
+        self.flight.move()
+
+    def _step(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        self.flight.gps_step = self._steps.take(fields, t_s)
+
+    def _attitude(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+        self.flight.attitude.take(self.flight.boot, (t_s, *attitude(fields)))
+
+    def _imu(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         flight = self.flight
-        if name == "HEARTBEAT":
-            if number(fields, "autopilot") == flight.autopilot and number(fields, "type") == flight.type:
-                flight.beat(fields)  # a beat of another kind under the same id is not the vehicle's
-        elif name == "VFR_HUD":
-            flight.ground_speed_m_s = number(fields, "groundspeed")
-        elif name == "GLOBAL_POSITION_INT":
-            flight.height_m = number(fields, "relative_alt") / 1e3
-        elif name == "EXTENDED_SYS_STATE":
-            flight.landed_state = int(number(fields, "landed_state"))
+        flight.imu = found = imu(name, fields, flight.ardupilot) if flight.under_way else None
+        if found is not None and found.instance == 0:
+            gyro, acceleration, magnetic = found.gyro_rad_s or NONE, found.acceleration_m_s2 or NONE, found.field_mg or NONE
+            flight.inertial.take(flight.boot, (t_s, *gyro, *acceleration, *magnetic))
 
     def finish(self) -> list[Finding]:
         """What was found, one finding a check, in the order of the table."""
@@ -176,12 +199,12 @@ class Bench:
         return Finding(check.id, result.status, result.text)
 
     def _result(self, check: Check, unit: Unit) -> Result:
-        if EVERY_FRAME in check.needs:
+        if EVERY_FRAME in check.needs or EVERY_BEAT in check.needs:
             return unit.finish()
         if self.flight.sysid is None:
             return absent("no autopilot's HEARTBEAT")
         for names in check.needs:
-            if not any(name in self._heard for name in names.split("|")):
+            if not any(by_name(name).id in self._heard for name in names.split("|")):
                 return absent(f"no {names.replace('|', ' or ')} message")
         return unit.finish()
 

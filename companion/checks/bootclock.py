@@ -37,7 +37,7 @@ class Jump:
 
 @dataclass(slots=True)
 class BootClock:
-    """`take` each message of the vehicle -> seconds since boot; before the first stamp, seconds since the first arrival."""
+    """`arrive`, then `read` or `now_s` -> seconds since boot; before the first stamp, seconds since the first arrival."""
 
     jumps: list[Jump] = field(default_factory=list)
     stamps: int = 0
@@ -58,29 +58,34 @@ class BootClock:
         """The first stamp, boot_s, is known to come after_s behind the first arrival: earlier frames count back from it."""
         self._begin_s = max(0.0, boot_s - after_s)
 
-    def take(self, fields: Fields, arrival_s: float, armed: bool) -> float:
-        """arrival_s: NaN where the frame was not stamped."""
+    def arrive(self, arrival_s: float) -> None:
+        """Any frame, before it is read.  arrival_s: NaN where it was not stamped."""
         if math.isfinite(arrival_s):
-            self.backward += arrival_s < self._arrival_s - 1e-3
+            if arrival_s < self._arrival_s - 1e-3:
+                self.backward += 1
             self._arrival_s = arrival_s
             if math.isnan(self._first_arrival_s):
                 self._first_arrival_s = arrival_s
+
+    def read(self, fields: Fields, armed: bool) -> float:
+        """The time of a message of the vehicle: its own where it tells one, else `now_s`."""
         stamp = fields.get("time_boot_ms")
         if isinstance(stamp, int) and stamp > 0:
             return self._stamped(stamp / 1e3, armed)
         stamp = fields.get("time_usec")
         if self.started and isinstance(stamp, int) and abs(stamp / 1e6 - self._boot_s) < NEAR_S:
             return stamp / 1e6
-        return self.now_s
+        return self.now_s()
 
-    @property
     def now_s(self) -> float:
         """The newest time known, carried on by arrivals."""
         if not self.started:
             passed_s = self._arrival_s - self._first_arrival_s
             return max(0.0, self._begin_s + (passed_s if math.isfinite(passed_s) else 0.0))
-        passed = self._arrival_s - self._boot_arrival_s
-        return self._boot_s + (min(max(passed, 0.0), CARRY_S) if math.isfinite(passed) else 0.0)
+        passed_s = self._arrival_s - self._boot_arrival_s
+        if 0.0 <= passed_s <= CARRY_S:
+            return self._boot_s + passed_s
+        return self._boot_s + (CARRY_S if passed_s > CARRY_S else 0.0)
 
     def _stamped(self, boot_s: float, armed: bool) -> float:
         self.stamps += 1
@@ -103,7 +108,7 @@ class BootClock:
             return self._accept(boot_s)
         self._suspect_s = boot_s
         self.strays += 1
-        return self.now_s
+        return self.now_s()
 
     def _accept(self, boot_s: float) -> float:
         self._boot_s, self._boot_arrival_s = boot_s, self._arrival_s

@@ -4,7 +4,7 @@ Records and small pure machines; the checks themselves are in the files beside t
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, Protocol
@@ -14,6 +14,8 @@ from companion.events import Json
 from companion.frames import Frame
 
 EVERY_FRAME: Final = "*"  # in `Check.needs`: every frame of every system, undecoded
+EVERY_BEAT: Final = "HEARTBEAT of every system"
+HOLD_S: Final = 5.0  # what stands for less is forgiven, where a check says nothing else
 BACK_S: Final = 2.0  # a clock further back than this has restarted; less is the order of messages
 SOURCE_OURS: Final = "docs/checks.md, margins"  # limits set by what healthy flights show
 
@@ -155,7 +157,8 @@ class Held:
         if stands:
             if self._start_s is None:
                 self._start_s, self._worst = t_s, size
-            self._worst = max(self._worst, size)
+            elif size > self._worst:
+                self._worst = size
         elif self._start_s is not None:
             self._close(t_s)
         self._last_s = t_s
@@ -178,6 +181,83 @@ class Held:
         return tuple(self._spans)
 
 
+@dataclass(slots=True)
+class Excess:
+    """A value against its limit: the spans in which it stood beyond it for hold_s, and how far it went.
+
+    below: the small values are the wrong ones.  farthest: of all samples; worst: of those within the spans.
+    """
+
+    limit: float
+    hold_s: float = HOLD_S
+    below: bool = False
+    farthest: float = field(init=False)
+    _held: Held = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.farthest = math.inf if self.below else -math.inf
+        self._held = Held(self.hold_s)
+
+    @property
+    def samples(self) -> int:
+        return self._held.samples
+
+    @property
+    def worst(self) -> float:
+        return self.limit - self._held.worst if self.below else self.limit + self._held.worst
+
+    def take(self, t_s: float, value: float) -> None:
+        """One sample; NaN: it cannot be judged, and what stood so far ends here."""
+        if math.isnan(value):
+            self._held.stop()
+            return
+        over = self.limit - value if self.below else value - self.limit
+        self.farthest = min(self.farthest, value) if self.below else max(self.farthest, value)
+        self._held.take(t_s, over > 0.0, over)
+
+    def spans(self) -> tuple[Span, ...]:
+        return self._held.spans()
+
+    def result(self, check: Check, nothing: str, beyond: str, within: str) -> Result:
+        """The three outcomes in these words: no sample, too far, never.
+
+        beyond and within may name {farthest}; beyond may name {worst} and {lasted_s}, of all spans together, too.
+        """
+        if not self.samples:
+            return absent(nothing)
+        spans = self.spans()
+        if not spans:
+            return fine(within.format(farthest=self.farthest))
+        return found(check, beyond.format(farthest=self.farthest, worst=self.worst, lasted_s=total_s(spans)), spans)
+
+
+@dataclass(slots=True)
+class Joined:
+    """Spans, one after the other; what begins less than gap_s behind the end of the one before continues it."""
+
+    gap_s: float
+    spans: list[Span] = field(default_factory=list)
+
+    def add(self, start_s: float, end_s: float) -> None:
+        if self.spans and start_s - self.spans[-1][1] < self.gap_s:
+            before_s, last_s = self.spans[-1]
+            self.spans[-1] = (before_s, max(end_s, last_s))
+        else:
+            self.spans.append((start_s, end_s))
+
+
+def runs(beyond: Iterable[bool], least: int) -> Iterator[tuple[int, int]]:
+    """(first, last) place of each run of true values that is at least so long."""
+    length = 0
+    for place, stands in enumerate([*beyond, False]):
+        if stands:
+            length += 1
+            continue
+        if length >= least:
+            yield place - length, place - 1
+        length = 0
+
+
 @dataclass(frozen=True, slots=True)
 class Mean:
     """The mean of a window: (column,) values and their standard errors."""
@@ -196,43 +276,28 @@ class Means:
     least: int = 8
     windows: list[Mean] = field(default_factory=list)
     _start_s: float | None = None
-    _last_s: float = 0.0
-    _count: int = 0
-    _sums: list[float] = field(default_factory=list)
-    _squares: list[float] = field(default_factory=list)
+    _samples: list[tuple[float, ...]] = field(default_factory=list)
 
     def take(self, t_s: float, values: tuple[float, ...]) -> None:
         """One sample, (column,); a NaN in it drops the sample."""
-        if not all(map(math.isfinite, values)):
+        if not math.isfinite(sum(values)):
             return
         if self._start_s is None or not -BACK_S < t_s - self._start_s < 1.5 * self.width_s:
-            self._begin(t_s, len(values))
+            self._start_s, self._samples = t_s, []
         elif t_s - self._start_s >= self.width_s:
-            self._close(t_s)
-            self._begin(t_s, len(values))
-        self._count += 1
-        self._last_s = t_s
-        for column, value in enumerate(values):
-            self._sums[column] += value
-            self._squares[column] += value * value
+            self._close(self._start_s, t_s)
+            self._start_s, self._samples = t_s, []
+        self._samples.append(values)
 
-    def _begin(self, t_s: float, columns: int) -> None:
-        self._start_s, self._count = t_s, 0
-        self._sums, self._squares = [0.0] * columns, [0.0] * columns
-
-    def _close(self, end_s: float) -> None:
-        if self._start_s is None or self._count < self.least:
+    def _close(self, start_s: float, end_s: float) -> None:
+        n = len(self._samples)
+        if n < self.least:
             return
-        n = self._count
-        mean = tuple(total / n for total in self._sums)
-        error = tuple(
-            math.sqrt(max(0.0, square / n - value * value) / n) for square, value in zip(self._squares, mean, strict=True)
-        )
-        self.windows.append(Mean(self._start_s, end_s, mean, error))
-
-    def restart(self) -> None:
-        """Drop the window under way, for the samples in it belong no longer together."""
-        self._start_s = None
+        columns = list(zip(*self._samples, strict=True))
+        mean = tuple(sum(column) / n for column in columns)
+        square = [sum([value * value for value in column]) / n for column in columns]
+        error = tuple(math.sqrt(max(0.0, s - m * m) / n) for s, m in zip(square, mean, strict=True))
+        self.windows.append(Mean(start_s, end_s, mean, error))
 
 
 def median(values: list[float]) -> float:
@@ -259,25 +324,18 @@ def change(windows: list[Mean], limit: float, references: int = 3, errors: float
         return None
     columns = range(len(windows[0].mean))
     reference = [median([window.mean[c] for window in windows[:references]]) for c in columns]
+    judged = windows[references:]
     largest, where = 0.0, 0
-    spans: list[Span] = []
-    standing: list[Mean] = []
-    for window in [*windows[references:], None]:
-        beyond = False
-        if window is not None:
-            for c in columns:
-                away = abs(window.mean[c] - reference[c])
-                if away > max(limit, errors * window.error[c]):
-                    beyond = True
-                    if away > largest:
-                        largest, where = away, c
-        if beyond and window is not None:
-            standing.append(window)
-            continue
-        if len(standing) >= run:
-            start_s, end_s = standing[0].start_s, standing[-1].end_s
-            if spans and start_s <= spans[-1][1]:  # overlapping windows
-                start_s = spans.pop()[0]
-            spans.append((start_s, end_s))
-        standing.clear()
-    return Change(largest, where, tuple(spans))
+    beyond: list[bool] = []
+    for window in judged:
+        beyond.append(False)
+        for c in columns:
+            away = abs(window.mean[c] - reference[c])
+            if away > max(limit, errors * window.error[c]):
+                beyond[-1] = True
+                if away > largest:
+                    largest, where = away, c
+    spans = Joined(1e-9)  # windows may overlap, or touch
+    for first, last in runs(beyond, run):
+        spans.add(judged[first].start_s, judged[last].end_s)
+    return Change(largest, where, tuple(spans.spans))

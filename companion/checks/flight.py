@@ -10,6 +10,8 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from companion.checks.finding import Span
+from companion.checks.reading import Imu, Step
+from companion.checks.series import Series
 from companion.dialect import Fields
 
 MOVING_M_S: Final = 1.0  # ground speed above which a vehicle is under way
@@ -66,6 +68,12 @@ class Flight:
     ground_speed_m_s: float = math.nan
     height_m: float = math.nan  # above home
     landed_state: int = mavlink.MAV_LANDED_STATE_UNDEFINED
+    airborne: bool = False  # in the air as far as is known; False where nothing tells
+    under_way: bool = False  # in the air, or moving on the ground or water; where nothing tells, armed is enough
+    imu: Imu | None = None  # what the inertial message in hand holds; None while not under way
+    attitude: Series = field(default_factory=Series)  # rows of ATTITUDE: ANGLES, then RATES
+    inertial: Series = field(default_factory=Series)  # of the first sensor while under way: GYRO, ACCELERATION, MAGNETIC
+    gps_step: Step | None = None  # to the GPS_RAW_INT in hand from the one before
     armed_spans: list[Span] = field(default_factory=list)
     modes: list[tuple[float, str]] = field(default_factory=list)
     _armed_since_s: float = 0.0
@@ -82,27 +90,19 @@ class Flight:
     def ardupilot(self) -> bool:
         return bool(self.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA)
 
-    @property
-    def moving(self) -> bool:
-        return self.armed and self.ground_speed_m_s > MOVING_M_S
+    def move(self) -> None:
+        """Follow what changed of armed state, speed, height or landed state: asked for far more often than it changes."""
+        self.airborne = self.armed and self._in_air()
+        moving = self.armed and self.ground_speed_m_s > MOVING_M_S
+        untold = self.armed and math.isnan(self.ground_speed_m_s) and math.isnan(self.height_m)
+        self.under_way = self.airborne or (moving and not self.rotors) or untold
 
-    @property
-    def airborne(self) -> bool:
-        """In the air as far as is known; False where nothing tells."""
-        if not self.armed or self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND:
-            return False
-        if self.landed_state == mavlink.MAV_LANDED_STATE_IN_AIR:
-            return True
+    def _in_air(self) -> bool:
+        if self.landed_state in (mavlink.MAV_LANDED_STATE_ON_GROUND, mavlink.MAV_LANDED_STATE_IN_AIR):
+            return bool(self.landed_state == mavlink.MAV_LANDED_STATE_IN_AIR)
         if self.fixed_wing:
             return self.ground_speed_m_s > FLYING_M_S
         return self.rotors and self.height_m > AIRBORNE_M
-
-    @property
-    def under_way(self) -> bool:
-        """In the air, or moving on the ground or water; where nothing tells, armed is enough."""
-        if self.airborne or (self.moving and not self.rotors):
-            return True
-        return self.armed and math.isnan(self.ground_speed_m_s) and math.isnan(self.height_m)
 
     def beat(self, fields: Fields) -> None:
         """A HEARTBEAT of the vehicle's autopilot."""

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from companion.checks.finding import Check, Means, Result, Span, absent, fine, found, median, number
 from companion.checks.flight import Flight
-from companion.checks.gps import FIX_3D
+from companion.checks.reading import FIX_3D
 from companion.dialect import Fields
 from companion.frames import Frame
 

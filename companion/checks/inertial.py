@@ -4,28 +4,25 @@ What is compared is the change within the flight: a constant bias belongs to the
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import Enum
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
 
 from companion.checks.finding import Check, Held, Means, Result, Span, Status, absent, change, fine, found, median, number
 from companion.checks.flight import Flight
+from companion.checks.reading import ACCELERATION, ANGLES, GYRO, RATES, STANDARD_GRAVITY_M_S2, Imu, Triple
 from companion.checks.series import Series, between, body_to_ned, overlapping, slope, unwrapped, windowed
 from companion.dialect import Fields
 from companion.frames import Frame
 
-STANDARD_GRAVITY_M_S2: Final = 9.80665
-MG_M_S2: Final = STANDARD_GRAVITY_M_S2 / 1000.0
 TOGETHER_S: Final = 0.05  # samples of two sensors nearer than this are of one moment
-PAIR_WINDOW_S: Final = 10.0
 BIAS_WINDOW_S: Final = 20.0
 MOTION_WINDOW_S: Final = 30.0
 MOTION_HOP_S: Final = 10.0
 MOTION_REFERENCES: Final = 9
-LEAST_WINDOWS: Final = 6
-PAIR_RUN: Final = 3  # windows: half a minute apart is a drift, less may be a knock
 ATTITUDE_GAP_S: Final = 0.6
 MOTION_GAP_S: Final = 0.35  # of the attitude: thinner streams turn the force of a bend into the wrong axis
 VELOCITY_GAP_S: Final = 0.6  # a thinner stream misses what happens in turns
@@ -33,53 +30,55 @@ FROZEN_SAMPLES: Final = 10
 TURNED_RAD: Final = 0.1
 AXES: Final = "xyz"
 
-Triple = tuple[float, float, float]
 
-NAMES: Final = {ending: ("x" + ending, "y" + ending, "z" + ending) for ending in ("acc", "gyro", "mag")}
-# Instance of the sensor by message; HIGHRES_IMU says its own.
-INSTANCES: Final = {"RAW_IMU": 0, "SCALED_IMU": 0, "SCALED_IMU2": 1, "SCALED_IMU3": 2}
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """What two sensors are compared in.
 
-
-class Quantity(Enum):
-    """What two sensors are compared in: (fields' ending, SI per wire unit of the scaled messages, unit, farthest apart).
-
-    The last figure, for what stands throughout, is ArduPilot's pre-arm limit: 5 deg/s for gyros,
-    ARMING_ACCTHRESH 0.75 m/s2 for accelerometers.
+    of: its part of a message.  least: windows of window_s without which nothing is judged; run: so many in a row are a
+    drift and no knock.  apart: farthest that they may be from each other throughout.
     """
 
-    GYRO = ("gyro", 1e-3, "rad/s about", 0.0873)
-    ACCELEROMETER = ("acc", MG_M_S2, "m/s2 along", 0.75)
-
-    def __init__(self, ending: str, scale: float, unit: str, apart: float) -> None:
-        # Plain attributes, and the plain hash: `value` and Enum's own hash go through Python at every sample.
-        self.ending, self.scale, self.unit, self.apart = ending, scale, unit, apart
-
-    __hash__ = object.__hash__
-
-
-def triple(fields: Fields, ending: str, scale: float) -> Triple:
-    """Fields x, y, z with this ending, times scale."""
-    x, y, z = NAMES[ending]
-    return number(fields, x) * scale, number(fields, y) * scale, number(fields, z) * scale
+    of: Callable[[Imu], Triple | None]
+    size: str  # how a change is said
+    together: str
+    nothing: str = "no two sensors side by side for a minute under way"
+    window_s: float = 10.0
+    least: int = 6
+    run: int = 3
+    apart: float = math.inf
+    apart_unit: str = ""
 
 
-def sensed(name: str, fields: Fields, flight: Flight, quantity: Quantity) -> tuple[int, Triple] | None:
-    """(instance, body FRD, SI) of an inertial message; None where it holds no inertial sensor.
-
-    RAW_IMU has units only with ArduPilot, which sends it like SCALED_IMU (GCS_Common.cpp); elsewhere it is counts.
-    """
-    if name == "RAW_IMU" and not flight.ardupilot:
-        return None
-    if not (fields["xacc"] or fields["yacc"] or fields["zacc"]):
-        return None  # no accelerometer reads zero on all axes: there is none (SCALED_IMU3 often holds a compass alone)
-    if name == "HIGHRES_IMU":
-        return int(number(fields, "id")), triple(fields, quantity.ending, 1.0)
-    return INSTANCES[name], triple(fields, quantity.ending, quantity.scale)
+# Throughout: ArduPilot's pre-arm limits, 5 deg/s for gyros, ARMING_ACCTHRESH 0.75 m/s2.
+GYROS: Final = Quantity(
+    attrgetter("gyro_rad_s"),
+    "{size:.3f} rad/s about {axis}",
+    "{count} sensors stay together",
+    apart=0.0873,
+    apart_unit="rad/s",
+)
+ACCELEROMETERS: Final = Quantity(
+    attrgetter("acceleration_m_s2"),
+    "{size:.3f} m/s2 along {axis}",
+    "{count} sensors stay together",
+    apart=0.75,
+    apart_unit="m/s2",
+)
+COMPASSES: Final = Quantity(
+    attrgetter("field_mg"),
+    "{size:.0f} mG along {axis}",
+    "stay together",
+    "no two compasses side by side for two minutes under way",
+    window_s=20.0,
+    least=5,
+    run=2,
+)
 
 
 @dataclass(slots=True)
 class Pair:
-    """Checks `gyro_pair`, `accelerometer_pair`: two sensors of one kind drift apart while under way."""
+    """Checks `gyro_pair`, `accelerometer_pair`, `compass_pair`: two sensors of one kind drift apart while under way."""
 
     check: Check
     flight: Flight
@@ -89,48 +88,54 @@ class Pair:
     _others: dict[int, Means] = field(default_factory=dict)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        if not self.flight.under_way:
+        imu = self.flight.imu
+        if imu is None or (value := self.quantity.of(imu)) is None:
             return
-        sample = sensed(name, fields, self.flight, self.quantity)
-        if sample is None:
-            return
-        instance, value = sample
-        if instance == 0:
+        if imu.instance == 0:
             if self._first_name in ("", name):
                 self._first_name = name
                 self._first = (t_s, value)
             return
         if self._first is None or abs(t_s - self._first[0]) > TOGETHER_S:
             return
-        if instance not in self._others:
-            self._others[instance] = Means(PAIR_WINDOW_S)
+        if imu.instance not in self._others:
+            self._others[imu.instance] = Means(self.quantity.window_s)
         one = self._first[1]
-        self._others[instance].take(t_s, (one[0] - value[0], one[1] - value[1], one[2] - value[2]))
+        self._others[imu.instance].take(t_s, (one[0] - value[0], one[1] - value[1], one[2] - value[2]))
 
     def finish(self) -> Result:
-        judged = {instance: means.windows for instance, means in self._others.items() if len(means.windows) >= LEAST_WINDOWS}
+        kind = self.quantity
+        judged = {instance: means.windows for instance, means in self._others.items() if len(means.windows) >= kind.least}
         if not judged:
-            return absent("no two sensors side by side for a minute under way")
-        unit, apart = self.quantity.unit, self.quantity.apart
+            return absent(kind.nothing)
         told: list[str] = []
         standing: list[str] = []
         spans: list[Span] = []
-        largest = 0.0
         for instance, windows in judged.items():
-            moved = change(windows, self.check.limit, run=PAIR_RUN)
-            assert moved is not None  # LEAST_WINDOWS are enough
-            largest = max(largest, moved.size)
+            moved = change(windows, self.check.limit, run=kind.run)
+            assert moved is not None  # `least` windows are enough
             if moved.spans:
-                told.append(f"1 and {instance + 1} by {moved.size:.3f} {unit} {AXES[moved.column]}")
+                told.append(f"1 and {instance + 1} by {kind.size.format(size=moved.size, axis=AXES[moved.column])}")
                 spans += moved.spans
-            usual = [median([window.mean[c] for window in windows]) for c in range(3)]
-            if math.hypot(*usual) > apart:
-                standing.append(f"1 and {instance + 1} by {math.hypot(*usual):.3f} {unit.split()[0]} throughout")
+            apart = math.hypot(*(median([window.mean[c] for window in windows]) for c in range(3)))
+            if apart > kind.apart:
+                standing.append(f"1 and {instance + 1} by {apart:.3f} {kind.apart_unit} throughout")
         if told:
             return found(self.check, ", ".join(told), tuple(sorted(spans)))
         if standing:
             return found(self.check, ", ".join(standing), (), Status.WARNING)
-        return fine(f"{len(judged) + 1} sensors stay together")
+        return fine(kind.together.format(count=len(judged) + 1))
+
+
+@dataclass(slots=True)
+class _Repeat:
+    """A sensor's newest sample, since when it has been the same, and how far the vehicle had turned by then."""
+
+    value: Triple | None = None
+    since_s: float = 0.0
+    turned_rad: float = 0.0
+    count: int = 0
+    held: Held = field(default_factory=lambda: Held(0.0))
 
 
 @dataclass(slots=True)
@@ -139,10 +144,9 @@ class Frozen:
 
     check: Check
     flight: Flight
-    _same: dict[tuple[int, Quantity], tuple[Triple, float, float, int]] = field(default_factory=dict)
+    _repeats: dict[int, tuple[_Repeat, _Repeat]] = field(default_factory=dict)
     _turned_rad: float = 0.0  # summed changes of attitude
     _attitude: Triple | None = None
-    _held: dict[tuple[int, Quantity], Held] = field(default_factory=dict)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         if name == "ATTITUDE":
@@ -154,33 +158,36 @@ class Frozen:
             self._attitude = attitude
             return
         if not self.flight.under_way:
-            self._same.clear()
+            for gyro, accelerometer in self._repeats.values():
+                gyro.value = accelerometer.value = None
             return
-        for quantity in Quantity:
-            sample = sensed(name, fields, self.flight, quantity)
-            if sample is None:
-                return
-            key = (sample[0], quantity)
-            same = self._same.get(key)
-            held = self._held.get(key)
-            if held is None:
-                held = self._held[key] = Held(0.0)
-            if same is None or same[0] != sample[1]:
-                self._same[key] = (sample[1], t_s, self._turned_rad, 1)
-                held.take(t_s, False)
+        imu = self.flight.imu
+        if imu is None or imu.acceleration_m_s2 is None:
+            return
+        repeats = self._repeats.get(imu.instance)
+        if repeats is None:
+            repeats = self._repeats[imu.instance] = (_Repeat(), _Repeat())
+        for repeat, value in zip(repeats, (imu.gyro_rad_s, imu.acceleration_m_s2), strict=True):
+            if repeat.value != value:
+                repeat.value, repeat.since_s, repeat.turned_rad, repeat.count = value, t_s, self._turned_rad, 1
+                repeat.held.take(t_s, False)
                 continue
-            count = same[3] + 1
-            self._same[key] = (same[0], same[1], same[2], count)
-            stuck = count >= FROZEN_SAMPLES and t_s - same[1] >= self.check.limit and self._turned_rad - same[2] > TURNED_RAD
-            held.take(t_s, stuck)
+            repeat.count += 1
+            lasting = repeat.count >= FROZEN_SAMPLES and t_s - repeat.since_s >= self.check.limit
+            repeat.held.take(t_s, lasting and self._turned_rad - repeat.turned_rad > TURNED_RAD)
 
     def finish(self) -> Result:
-        if not self._held:
+        if not self._repeats:
             return absent("no inertial sensor's message while under way")
-        bad = {key: held.spans() for key, held in self._held.items()}
-        told = [f"{quantity.name.lower()} {instance + 1}" for (instance, quantity), spans in bad.items() if spans]
+        told: list[str] = []
+        spans: list[Span] = []
+        for instance, repeats in self._repeats.items():
+            for kind, repeat in zip(("gyro", "accelerometer"), repeats, strict=True):
+                stuck = repeat.held.spans()
+                told += [f"{kind} {instance + 1}"] if stuck else []
+                spans += stuck
         if told:
-            return found(self.check, ", ".join(told), tuple(sorted(span for spans in bad.values() for span in spans)))
+            return found(self.check, ", ".join(told), tuple(sorted(spans)))
         return fine("all samples differ")
 
 
@@ -193,25 +200,15 @@ class GyroBias:
 
     check: Check
     flight: Flight
-    _gyro: Series = field(default_factory=Series)
-    _rates: Series = field(default_factory=Series)
 
-    def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        if name == "ATTITUDE":
-            rates = (number(fields, "rollspeed"), number(fields, "pitchspeed"), number(fields, "yawspeed"))
-            self._rates.take(self.flight.boot, (t_s, *rates))
-            return
-        if self.flight.under_way:
-            sample = sensed(name, fields, self.flight, Quantity.GYRO)
-            if sample is not None and sample[0] == 0:
-                self._gyro.take(self.flight.boot, (t_s, *sample[1]))
+    def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None: ...
 
     def finish(self) -> Result:
-        boot = self._gyro.longest()
+        boot = self.flight.inertial.longest(GYRO)
         if boot is None:
             return absent("no gyro with known units while under way")
-        gyro = self._gyro.table(boot)
-        bias = gyro[:, 1:] - between(gyro[:, 0], self._rates.table(boot), ATTITUDE_GAP_S)
+        gyro = self.flight.inertial.table(boot, GYRO)
+        bias = gyro[:, 1:] - between(gyro[:, 0], self.flight.attitude.table(boot, RATES), ATTITUDE_GAP_S)
         moved = change(windowed(gyro[:, 0], bias, BIAS_WINDOW_S), self.check.limit)
         if moved is None:
             return absent("no two minutes of gyro and ATTITUDE, twice a second or more, under way")
@@ -229,29 +226,20 @@ class AccelerometerMotion:
 
     check: Check
     flight: Flight
-    _force: Series = field(default_factory=Series)
-    _attitude: Series = field(default_factory=Series)
     _velocity: Series = field(default_factory=Series)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        boot = self.flight.boot
-        if name == "ATTITUDE":
-            self._attitude.take(boot, (t_s, number(fields, "roll"), number(fields, "pitch"), number(fields, "yaw")))
-        elif name == "GLOBAL_POSITION_INT":
+        if name == "GLOBAL_POSITION_INT":
             velocity = (number(fields, "vx") / 100.0, number(fields, "vy") / 100.0, number(fields, "vz") / 100.0)
-            self._velocity.take(boot, (t_s, *velocity))
-        elif self.flight.under_way:
-            sample = sensed(name, fields, self.flight, Quantity.ACCELEROMETER)
-            if sample is not None and sample[0] == 0:
-                self._force.take(boot, (t_s, *sample[1]))
+            self._velocity.take(self.flight.boot, (t_s, *velocity))
 
     def finish(self) -> Result:
-        boot = self._force.longest()
+        boot = self.flight.inertial.longest(ACCELERATION)
         if boot is None:
             return absent("no accelerometer with known units while under way")
-        force = self._force.table(boot)
+        force = self.flight.inertial.table(boot, ACCELERATION)
         t_s = force[:, 0]
-        attitude = between(t_s, unwrapped(self._attitude.table(boot), -1), MOTION_GAP_S)
+        attitude = between(t_s, unwrapped(self.flight.attitude.table(boot, ANGLES), -1), MOTION_GAP_S)
         acceleration = between(t_s, slope(self._velocity.table(boot), VELOCITY_GAP_S), 2.0 * VELOCITY_GAP_S)
         if attitude.shape[1] != 3 or acceleration.shape[1] != 3:
             return absent("no ATTITUDE and GLOBAL_POSITION_INT beside the accelerometer")

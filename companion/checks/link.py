@@ -14,6 +14,7 @@ from companion.frames import Frame
 
 LATE: Final = 128  # a gap of more sequence numbers than this is a frame that came late or twice
 LEAST_FRAMES: Final = 100
+MOST_TOLD: Final = 6
 RATE_WINDOW_S: Final = 1.0
 FLOOD_S: Final = 3.0  # a burst is shorter
 FLOOD_BEATS_HZ: Final = 50.0  # a heartbeat comes once a second; some ground stations send ten, nobody fifty
@@ -26,52 +27,56 @@ def named(source: Source) -> str:
 
 
 @dataclass(slots=True)
+class _Numbers:
+    """The sequence numbers of one source."""
+
+    last: int
+    frames: int = 0
+    lost: int = 0
+    late: int = 0
+
+
+@dataclass(slots=True)
 class Loss:
     """Check `link_loss`: gaps in the sequence numbers of each system and component."""
 
     check: Check
     flight: Flight
-    _last: dict[Source, int] = field(default_factory=dict)
-    _frames: Counter[Source] = field(default_factory=Counter)
-    _lost: Counter[Source] = field(default_factory=Counter)
-    _late: Counter[Source] = field(default_factory=Counter)
+    _sources: dict[Source, _Numbers] = field(default_factory=dict)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        source = (frame.sysid, frame.compid)
-        self._frames[source] += 1
-        last = self._last.get(source)
-        self._last[source] = frame.seq
-        if last is None:
-            return
-        gap = (frame.seq - last - 1) & 0xFF
-        if gap == 0:
-            return
+        seq = frame.seq
+        numbers = self._sources.get((frame.sysid, frame.compid))
+        if numbers is None:
+            numbers = self._sources[frame.sysid, frame.compid] = _Numbers(seq - 1)
+        numbers.frames += 1
+        gap = (seq - numbers.last - 1) & 0xFF
+        numbers.last = seq
         if gap > LATE:
-            self._late[source] += 1
-        else:
-            self._lost[source] += gap
+            numbers.late += 1
+        elif gap:
+            numbers.lost += gap
 
     def finish(self) -> Result:
         vehicle = self._vehicle()
         if vehicle is None:
             return absent("no autopilot sent enough frames")
         parts: list[str] = []
-        for source, frames in self._frames.most_common(6):
-            lost, late = self._lost[source], self._late[source]
-            if lost or (late and source == vehicle):
-                told = f"{named(source)} {100.0 * lost / (frames + lost):.1f} % of {frames + lost} lost"
-                parts.append(told + (f", {late} late or twice" if late else ""))
-        lost, frames = self._lost[vehicle], self._frames[vehicle]
+        most = sorted(self._sources.items(), key=lambda item: item[1].frames, reverse=True)
+        for source, numbers in most[:MOST_TOLD]:
+            if numbers.lost or (numbers.late and numbers is vehicle):
+                sent = numbers.frames + numbers.lost
+                told = f"{named(source)} {100.0 * numbers.lost / sent:.1f} % of {sent} lost"
+                parts.append(told + (f", {numbers.late} late or twice" if numbers.late else ""))
         told = "; ".join(parts) or "none lost"
-        if 100.0 * lost / (frames + lost) > self.check.limit:
+        if 100.0 * vehicle.lost / (vehicle.frames + vehicle.lost) > self.check.limit:
             return found(self.check, told, ())
         return fine(told)
 
-    def _vehicle(self) -> Source | None:
+    def _vehicle(self) -> _Numbers | None:
         sysid, compid = self.flight.sysid, self.flight.compid
-        if sysid is None or compid is None or self._frames[sysid, compid] < LEAST_FRAMES:
-            return None
-        return sysid, compid
+        found = self._sources.get((sysid, compid)) if sysid is not None and compid is not None else None
+        return found if found is not None and found.frames >= LEAST_FRAMES else None
 
 
 @dataclass(slots=True)
@@ -88,15 +93,16 @@ class Silence:
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         flight = self.flight
-        if frame.sysid != flight.sysid or frame.compid != flight.compid or not math.isfinite(flight.arrival_s):
+        arrival_s = flight.arrival_s
+        if frame.compid != flight.compid or frame.sysid != flight.sysid or not math.isfinite(arrival_s):
             return
-        gap_s = flight.arrival_s - self._arrival_s  # NaN for the first
+        gap_s = arrival_s - self._arrival_s  # NaN for the first
         self._samples += 1
         if gap_s > self._longest_s:
             self._longest_s = gap_s
         if gap_s > self.check.limit:
             self._spans.append((self._t_s, max(t_s, self._t_s)))
-        self._arrival_s, self._t_s = flight.arrival_s, t_s
+        self._arrival_s, self._t_s = arrival_s, t_s
 
     def finish(self) -> Result:
         if self._samples < 2:
@@ -108,58 +114,66 @@ class Silence:
 
 
 @dataclass(slots=True)
+class _Rate:
+    """What one source sends."""
+
+    begun_s: float = math.nan  # the window under way: arrival
+    begun_t_s: float = 0.0  # and vehicle clock
+    frames: int = 0
+    beats: int = 0
+    most_hz: float = 0.0  # of the windows that were too much
+    most_beats_hz: float = 0.0
+    spans: list[Span] = field(default_factory=list)
+
+
+@dataclass(slots=True)
 class Flood:
     """Check `link_flood`: somebody who is not the vehicle sends more than anybody should, or beats as nobody does."""
 
     check: Check
     flight: Flight
-    _begun: dict[Source, tuple[float, float]] = field(default_factory=dict)  # arrival, vehicle clock
-    _count: Counter[Source] = field(default_factory=Counter)
-    _beats: Counter[Source] = field(default_factory=Counter)
-    _worst: dict[Source, tuple[float, float]] = field(default_factory=dict)  # frames/s, heartbeats/s
-    _spans: dict[Source, list[Span]] = field(default_factory=dict)
-    _stamped: int = 0
+    _rates: dict[Source, _Rate] = field(default_factory=dict)
+    _too_much: dict[Source, _Rate] = field(default_factory=dict)  # in the order in which they first were
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         now_s = self.flight.arrival_s
         if not math.isfinite(now_s):
             return
-        self._stamped += 1
-        source = (frame.sysid, frame.compid)
-        begun = self._begun.get(source)
-        if begun is None or not 0.0 <= now_s - begun[0] < RATE_WINDOW_S:
-            if begun is not None:
+        rate = self._rates.get((frame.sysid, frame.compid))
+        if rate is None:
+            rate = self._rates[frame.sysid, frame.compid] = _Rate()
+        if not 0.0 <= now_s - rate.begun_s < RATE_WINDOW_S:  # nor of the first, whose begin is NaN
+            if rate.frames:
                 # The vehicle's clock counts too: a log written faster than it was flown is no flood.
-                self._close(source, max(now_s - begun[0], t_s - begun[1]), t_s)
-            self._begun[source] = (now_s, t_s)
-            self._count[source] = self._beats[source] = 0
-        self._count[source] += 1
+                self._close((frame.sysid, frame.compid), rate, max(now_s - rate.begun_s, t_s - rate.begun_t_s), t_s)
+            rate.begun_s, rate.begun_t_s, rate.frames, rate.beats = now_s, t_s, 0, 0
+        rate.frames += 1
         if name == "HEARTBEAT":
-            self._beats[source] += 1
+            rate.beats += 1
 
-    def _close(self, source: Source, length_s: float, t_s: float) -> None:
+    def _close(self, source: Source, rate: _Rate, length_s: float, t_s: float) -> None:
         length_s = max(length_s, RATE_WINDOW_S)
-        rate_hz, beats_hz = self._count[source] / length_s, self._beats[source] / length_s
+        rate_hz, beats_hz = rate.frames / length_s, rate.beats / length_s
         own = source[0] == self.flight.sysid
         if not (beats_hz > FLOOD_BEATS_HZ or (rate_hz > self.check.limit and not own)):
             return
-        before = self._worst.get(source, (0.0, 0.0))
-        self._worst[source] = (max(before[0], rate_hz), max(before[1], beats_hz))
-        spans = self._spans.setdefault(source, [])
+        self._too_much[source] = rate
+        rate.most_hz, rate.most_beats_hz = max(rate.most_hz, rate_hz), max(rate.most_beats_hz, beats_hz)
+        spans = rate.spans
         if spans and t_s - spans[-1][1] < 3.0 * RATE_WINDOW_S:
             spans[-1] = (spans[-1][0], max(t_s, spans[-1][1]))
         else:
             spans.append((t_s - min(length_s, t_s), t_s))
 
     def finish(self) -> Result:
-        if not self._stamped:
+        if not self._rates:
             return absent("no stamped frames")
-        spans = {source: lasting for source, found in self._spans.items() if (lasting := _lasting(found))}
+        spans = {source: lasting for source, rate in self._too_much.items() if (lasting := _lasting(rate.spans))}
         if not spans:
             return fine("no source sends more than it should")
         told = "; ".join(
-            f"{named(source)} up to {rate_hz:.0f} frames/s, {beats_hz:.0f} of them heartbeats"
-            for source, (rate_hz, beats_hz) in self._worst.items()
+            f"{named(source)} up to {rate.most_hz:.0f} frames/s, {rate.most_beats_hz:.0f} of them heartbeats"
+            for source, rate in self._too_much.items()
             if source in spans
         )
         return found(self.check, told, tuple(sorted(span for lasting in spans.values() for span in lasting)))
@@ -179,8 +193,6 @@ class Identity:
     _first_s: dict[Source, float] = field(default_factory=dict)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        if name != "HEARTBEAT":
-            return
         beat = frame.fields()
         kind, autopilot = beat["type"], beat["autopilot"]
         assert isinstance(kind, int)

@@ -8,7 +8,7 @@ from companion.checks.flight import MOTORS, Flight
 from companion.dialect import Fields
 from companion.frames import Frame
 
-OUTPUTS: Final = tuple((place, f"servo{place}_raw") for place in range(1, 9))
+OUTPUTS: Final = tuple((n, f"servo{n}_raw", f"SERVO{n}_MIN", f"SERVO{n}_MAX") for n in range(1, 9))
 LOW_US, HIGH_US = 1100.0, 1900.0  # defaults of ArduPilot's SERVOn_MIN and SERVOn_MAX
 MOVED_US: Final = 100.0  # an output that moved by less carries no control
 ALIVE_US: Final = range(700, 2301)  # pulses that a servo could mean; 0 is off
@@ -50,7 +50,7 @@ class Saturation:
         if number(fields, "port") != 0.0:
             return
         under_way = self.flight.under_way
-        for place, field_name in OUTPUTS:
+        for place, field_name, lowest, highest in OUTPUTS:
             pulse_us = number(fields, field_name)
             output = self._outputs.get(place)
             if output is None:
@@ -63,8 +63,8 @@ class Saturation:
                 continue
             output.least_us = min(output.least_us, pulse_us)
             output.most_us = max(output.most_us, pulse_us)
-            output.low.take(t_s, pulse_us <= self._parameters.get(f"SERVO{place}_MIN", LOW_US))
-            output.high.take(t_s, pulse_us >= self._parameters.get(f"SERVO{place}_MAX", HIGH_US))
+            output.low.take(t_s, pulse_us <= self._parameters.get(lowest, LOW_US))
+            output.high.take(t_s, pulse_us >= self._parameters.get(highest, HIGH_US))
 
     def _idles(self, place: int) -> bool:
         function = self._parameters.get(f"SERVO{place}_FUNCTION")
@@ -103,7 +103,7 @@ class MotorBalance:
         motors = MOTORS.get(self.flight.type, 0)
         if not motors or number(fields, "port") != 0.0 or not self.flight.airborne:
             return
-        pulses_us = tuple(number(fields, field_name) for _, field_name in OUTPUTS[:motors])
+        pulses_us = tuple(number(fields, field_name) for _, field_name, _, _ in OUTPUTS[:motors])
         if min(pulses_us) > SPINNING_US:
             mean_us = sum(pulses_us) / motors
             self._means.take(t_s, tuple(pulse_us - mean_us for pulse_us in pulses_us))

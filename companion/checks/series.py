@@ -4,6 +4,7 @@ Samples of different boots never meet: their stamps are not of one clock.
 """
 
 import math
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -17,26 +18,36 @@ Array = NDArray[np.float64]
 
 @dataclass(slots=True)
 class Series:
-    """Rows of (t_s, value ...), by boot."""
+    """Rows of (t_s, value ...), by boot; all of one length."""
 
-    rows: dict[int, list[tuple[float, ...]]] = field(default_factory=dict)
+    columns: int = 1
+    _flat: dict[int, "array[float]"] = field(default_factory=dict)  # row behind row: tuples take four times the room
 
     def take(self, boot: int, row: tuple[float, ...]) -> None:
-        self.rows.setdefault(boot, []).append(row)
+        flat = self._flat.get(boot)
+        if flat is None:
+            self.columns = len(row)
+            flat = self._flat[boot] = array("d")
+        flat.extend(row)
 
-    def longest(self) -> int | None:
-        """The boot with the most rows; None if there are none."""
-        return max(self.rows, key=lambda boot: len(self.rows[boot]), default=None)
+    def longest(self, values: slice = slice(0, 1)) -> int | None:
+        """The boot with the most rows in which the first of these values is known; None if there are none."""
+        known = {boot: int(np.count_nonzero(~np.isnan(self._rows(boot)[:, 1 + values.start]))) for boot in self._flat}
+        return max(filter(known.__getitem__, known), key=known.__getitem__, default=None)
 
-    def table(self, boot: int) -> Array:
-        """(row, 1 + values) of one boot, finite rows in the order of time, of equal times the first."""
-        rows = self.rows.get(boot, [])
-        if not rows:
+    def _rows(self, boot: int) -> Array:
+        return np.array(self._flat[boot], dtype=np.float64).reshape(-1, self.columns)
+
+    def table(self, boot: int, values: slice = slice(None)) -> Array:
+        """(row, 1 + values) of one boot, all values or some: finite rows in the order of time, of equal times the first."""
+        if boot not in self._flat:
             return np.empty((0, 1))
-        table = np.array(rows, dtype=np.float64)
+        rows = self._rows(boot)
+        table = np.concatenate([rows[:, :1], rows[:, 1:][:, values]], axis=1)
         table = table[np.isfinite(table).all(axis=1)]
         _, first = np.unique(table[:, 0], return_index=True)
-        return table[first]
+        chosen: Array = table[first]
+        return chosen
 
 
 def between(t_s: Array, table: Array, gap_s: float) -> Array:

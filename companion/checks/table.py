@@ -20,11 +20,12 @@ from companion.checks import (
     tracking,
     vibration,
 )
-from companion.checks.finding import EVERY_FRAME, SOURCE_OURS, Check, Severity, Unit
+from companion.checks.finding import EVERY_BEAT, EVERY_FRAME, SOURCE_OURS, Check, Severity, Unit
 from companion.checks.flight import Flight
 
 INFO, WARNING, FAULT = Severity.INFO, Severity.WARNING, Severity.FAULT
 EVERY: Final = (EVERY_FRAME,)
+BEATS: Final = (EVERY_BEAT,)
 GPS: Final = ("GPS_RAW_INT",)
 IMU: Final = "RAW_IMU|SCALED_IMU|HIGHRES_IMU"
 IMUS: Final = "RAW_IMU|SCALED_IMU|SCALED_IMU2|SCALED_IMU3|HIGHRES_IMU"
@@ -36,7 +37,7 @@ Builder = Callable[[Check, Flight], Unit]
 
 # fmt: off
 ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
-    (Check("vehicles", EVERY, 0.0, "", "MAVLink heartbeat protocol", INFO, "vehicles in the log"), timeline.Vehicles),
+    (Check("vehicles", BEATS, 0.0, "", "MAVLink heartbeat protocol", INFO, "vehicles in the log"), timeline.Vehicles),
     (Check("arming", ("HEARTBEAT",), 0.0, "", "MAV_MODE_FLAG_SAFETY_ARMED", INFO, "armed"), timeline.Arming),
     (Check("modes", ("HEARTBEAT",), 0.0, "", "HEARTBEAT.custom_mode", INFO, "flight modes"), timeline.Modes),
     (Check("link_loss", EVERY, 5.0, "%", SOURCE_OURS, WARNING,
@@ -45,7 +46,7 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
            "nothing came from the vehicle"), link.Silence),
     (Check("link_flood", EVERY, 500.0, "frame/s", SOURCE_OURS, WARNING,
            "somebody floods the link"), link.Flood),
-    (Check("link_identity", EVERY, 1.0, "kind", "MAVLink routing: an id belongs to one component", WARNING,
+    (Check("link_identity", BEATS, 1.0, "kind", "MAVLink routing: an id belongs to one component", WARNING,
            "two speak under one id"), link.Identity),
     (Check("failsafe", ("STATUSTEXT",), 0.0, "", "ArduPilot's and PX4's failsafe texts", WARNING,
            "failsafe while armed"), texts.Failsafes),
@@ -56,9 +57,9 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
     (Check("gps_fix", GPS, 2.0, "s", "GPS_FIX_TYPE_3D_FIX, GPS_FIX_TYPE_NO_GPS", FAULT,
            "GPS lost its 3D fix while armed"), gps.Fix),
     (Check("gps_satellites", GPS, 6.0, "", "ArduPilot AHRS_GPS_MINSATS 6, PX4 EKF2_REQ_NSATS 6", WARNING,
-           "too few GPS satellites while armed"), gps.Satellites),
+           "too few GPS satellites while armed"), gps.satellites),
     (Check("gps_hdop", GPS, 3.0, "", "ArduPilot LogAnalyzer, HDOP warning", WARNING,
-           "GPS geometry bad while armed"), gps.Hdop),
+           "GPS geometry bad while armed"), gps.hdop),
     (Check("gps_accuracy", GPS, 5.0, "m", "ArduPilot EKF3, horizontal accuracy to align by GPS", WARNING,
            "GPS states a large error while armed"), gps.Accuracy),
     (Check("gps_jump", GPS, 25.0, "m", "ArduPilot EK3_GLITCH_RAD 25 m", FAULT,
@@ -70,7 +71,7 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
     (Check("ekf_flags", ESTIMATOR, 1.0, "s", "EKF_STATUS_FLAGS, ESTIMATOR_STATUS_FLAGS", WARNING,
            "the estimator withdrew what it knew while armed"), estimator.Flags),
     (Check("vibration", ("VIBRATION",), 30.0, "m/s2", "ArduPilot, measuring vibration", WARNING,
-           "vibration is high"), vibration.Vibration),
+           "vibration is high"), vibration.vibration),
     (Check("clipping", ("VIBRATION",), 100.0, "", "ArduPilot, measuring vibration", WARNING,
            "accelerometers were driven to their limit"), vibration.Clipping),
     (Check("battery_low", ("SYS_STATUS|BATTERY_STATUS",), 15.0, "%", "PX4 BAT_LOW_THR 15 %; MAV_BATTERY_CHARGE_STATE",
@@ -80,7 +81,7 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
     (Check("battery_drop", ("SYS_STATUS",), 0.08, "", SOURCE_OURS, FAULT,
            "battery voltage fell though no more current is drawn"), battery.Drop),
     (Check("power_rail", ("POWER_STATUS",), 4.6, "V", "ArduPilot LogAnalyzer, Vcc", WARNING,
-           "the autopilot's supply is weak while armed"), battery.Rail),
+           "the autopilot's supply is weak while armed"), battery.rail),
     (Check("sensor_health", ("SYS_STATUS",), 2.0, "s", "MAV_SYS_STATUS_SENSOR", FAULT,
            "not healthy by the autopilot's own judgement"), sensors.Health),
     (Check("output_saturation", ("SERVO_OUTPUT_RAW",), 10.0, "s", "ArduPilot SERVOn_MIN 1100, SERVOn_MAX 1900", WARNING,
@@ -90,9 +91,9 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
     (Check("attitude_tracking", ("NAV_CONTROLLER_OUTPUT|ATTITUDE_TARGET", "ATTITUDE"), 15.0, "deg",
            "ArduCopter thrust loss check, 15 deg", WARNING, "attitude does not follow its command"), tracking.Tracking),
     (Check("gyro_pair", (IMU, SECOND), 0.010, "rad/s", SOURCE_OURS, FAULT,
-           "gyros drifted apart"), partial(inertial.Pair, quantity=inertial.Quantity.GYRO)),
+           "gyros drifted apart"), partial(inertial.Pair, quantity=inertial.GYROS)),
     (Check("accelerometer_pair", (IMU, SECOND), 0.30, "m/s2", SOURCE_OURS, FAULT,
-           "accelerometers drifted apart"), partial(inertial.Pair, quantity=inertial.Quantity.ACCELEROMETER)),
+           "accelerometers drifted apart"), partial(inertial.Pair, quantity=inertial.ACCELEROMETERS)),
     (Check("imu_frozen", (IMUS, "ATTITUDE"), 5.0, "s", SOURCE_OURS, FAULT,
            "an inertial sensor repeats itself"), inertial.Frozen),
     (Check("gyro_bias", (IMU, "ATTITUDE"), 0.015, "rad/s", SOURCE_OURS, WARNING,
@@ -108,7 +109,7 @@ ROWS: Final[tuple[tuple[Check, Builder], ...]] = (
     (Check("compass_field", (IMUS,), 0.25, "", "ArduPilot LogAnalyzer, field change warning", WARNING,
            "the magnetic field's strength changes"), compass.Field),
     (Check("compass_pair", (IMU, SECOND), 75.0, "mG", SOURCE_OURS, WARNING,
-           "compasses drifted apart"), compass.CompassPair),
+           "compasses drifted apart"), partial(inertial.Pair, quantity=inertial.COMPASSES)),
     (Check("compass_offset", (IMU, "ATTITUDE"), 75.0, "mG", SOURCE_OURS, WARNING,
            "a compass offset came up in flight"), compass.Offset),
     (Check("heading_course", ("ATTITUDE", "GPS_RAW_INT"), 45.0, "deg", "ArduPilot pre-arm check: compasses 45 deg apart",

@@ -24,8 +24,6 @@ class Vehicles:
     _autopilots: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
-        if name != "HEARTBEAT":
-            return
         beat = heartbeat(frame)
         if beat.autopilot != mavlink.MAV_AUTOPILOT_INVALID and beat.type not in NO_VEHICLE:
             self._autopilots.setdefault((beat.sysid, beat.compid), (beat.type, beat.autopilot))

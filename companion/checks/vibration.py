@@ -4,40 +4,25 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.checks.finding import Check, Held, Result, Span, absent, fine, found, number, total_s
+from companion.checks.finding import HOLD_S, Check, Joined, Result, absent, fine, found, number
 from companion.checks.flight import Flight
+from companion.checks.level import Level
 from companion.dialect import Fields
 from companion.frames import Frame
 
-HOLD_S: Final = 5.0
 AXES: Final = ("vibration_x", "vibration_y", "vibration_z")
 COUNTERS: Final = ("clipping_0", "clipping_1", "clipping_2")
 
 
-@dataclass(slots=True)
-class Vibration:
+def vibration(check: Check, flight: Flight) -> Level:
     """Check `vibration`: the level of the worst axis while armed."""
 
-    check: Check
-    flight: Flight
-    _held: Held = field(default_factory=lambda: Held(HOLD_S))
-    _worst_m_s2: float = 0.0
-
-    def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
+    def read(fields: Fields) -> float:
         level_m_s2 = max(number(fields, axis) for axis in AXES)
-        if not self.flight.armed or not math.isfinite(level_m_s2):
-            self._held.stop()
-            return
-        self._worst_m_s2 = max(self._worst_m_s2, level_m_s2)
-        self._held.take(t_s, level_m_s2 > self.check.limit)
+        return level_m_s2 if math.isfinite(level_m_s2) else math.nan
 
-    def finish(self) -> Result:
-        if not self._held.samples:
-            return absent("no VIBRATION message while armed")
-        spans = self._held.spans()
-        if spans:
-            return found(self.check, f"up to {self._worst_m_s2:.0f} m/s2, {total_s(spans):.0f} s in all", spans)
-        return fine(f"at most {self._worst_m_s2:.1f} m/s2")
+    beyond = "up to {farthest:.0f} m/s2, {lasted_s:.0f} s in all"
+    return Level(check, flight, read, "no VIBRATION message while armed", beyond, "at most {farthest:.1f} m/s2")
 
 
 @dataclass(slots=True)
@@ -48,7 +33,7 @@ class Clipping:
     flight: Flight
     _last: dict[str, float] = field(default_factory=dict)
     _clips: dict[str, float] = field(default_factory=dict)
-    _spans: list[Span] = field(default_factory=list)
+    _clipped: Joined = field(default_factory=lambda: Joined(HOLD_S))
 
     def take(self, name: str, fields: Fields, t_s: float, frame: Frame) -> None:
         for counter in COUNTERS:
@@ -60,10 +45,7 @@ class Clipping:
             more = now - before
             self._clips[counter] = self._clips.get(counter, 0.0) + max(0.0, more)
             if more > 0.0:
-                if self._spans and t_s - self._spans[-1][1] < HOLD_S:
-                    self._spans[-1] = (self._spans[-1][0], max(t_s, self._spans[-1][1]))
-                else:
-                    self._spans.append((t_s, t_s))
+                self._clipped.add(t_s, t_s)
 
     def finish(self) -> Result:
         if not self._clips:
@@ -72,5 +54,5 @@ class Clipping:
             f"accelerometer {place + 1}: {self._clips.get(name, 0.0):.0f}" for place, name in enumerate(COUNTERS)
         )
         if max(self._clips.values()) > self.check.limit:
-            return found(self.check, told, tuple(self._spans))
+            return found(self.check, told, tuple(self._clipped.spans))
         return fine(f"{max(self._clips.values()):.0f} times at most")

@@ -1,6 +1,7 @@
 """`mavfdi analyze LOG…`: what happened in telemetry logs."""
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from companion import airframe as airframes
 from companion.airframe import Airframe
-from companion.analysis import Analysis, analyze, by_type
+from companion.analysis import WHOLE, Analysis, Part, analyze, by_type
 from companion.checks import Status
 from companion.cli import FAILED, arguments, compiling
 from companion.decision import Policy
@@ -34,6 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=[policy.value for policy in Policy],
         help="decide under this policy; default: the one that the log was recorded under, else advise",
     )
+    parser.add_argument("--from", dest="from_s", metavar="S", type=float, help="from so many seconds after the log's start")
+    parser.add_argument("--to", dest="to_s", metavar="S", type=float, help="up to so many seconds after it")
+    parser.add_argument("--systems", metavar="1,2", help="of these systems only")
     arguments.add_config(parser)
 
 
@@ -46,6 +50,7 @@ class Task:
     config: Path | None
     policy: str | None
     report: Path | None
+    part: Part
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,10 +69,13 @@ def main(args: argparse.Namespace) -> int:
         raise UserError(f"--jobs {args.jobs}: give 1 or more")
     if args.airframe != "auto":
         airframes.load(args.airframe, args.config)  # a wrong name is told once, not once a log
+    part = _part(args.from_s, args.to_s, args.systems)
+    if args.report is not None and part != WHOLE:
+        raise UserError("--report shows a whole log; leave out --from, --to and --systems")
     paths = list(_files(args.logs))
     if args.report is not None and len(paths) != 1:
         raise UserError(f"--report is for one log, not {len(paths)}")
-    tasks = [Task(path, args.airframe, args.config, args.policy, args.report) for path in paths]
+    tasks = [Task(path, args.airframe, args.config, args.policy, args.report, part) for path in paths]
     compiling.announce(paths, always=args.report is not None)
     done: list[Done] = []
     progress = _Progress(len(tasks))
@@ -87,6 +95,18 @@ def main(args: argparse.Namespace) -> int:
     if any(outcome.content is None for outcome in done):
         return FAILED
     return 1 if any(outcome.content is not None and outcome.content["verdict"] == "fault" for outcome in done) else 0
+
+
+def _part(from_s: float | None, to_s: float | None, systems: str | None) -> Part:
+    """What --from, --to and --systems say together.  Raises UserError."""
+    begin_s, end_s = from_s if from_s is not None else 0.0, to_s if to_s is not None else math.inf
+    if not (0.0 <= begin_s < end_s and begin_s < math.inf):  # so for NaN
+        raise UserError(f"--from {begin_s:g} --to {end_s:g}: give seconds from the log's start, the later one behind --to")
+    try:
+        numbers = frozenset(int(text) for text in systems.split(",")) if systems else frozenset()
+    except ValueError:
+        raise UserError(f"--systems {systems}: give numbers, for example 1,2") from None
+    return Part(begin_s, end_s, numbers)
 
 
 def _files(paths: list[Path]) -> Iterator[Path]:
@@ -122,7 +142,11 @@ def work(task: Task) -> Done:
     history = History() if task.report is not None else None
     try:
         found = analyze(
-            task.path, choose, Policy(task.policy) if task.policy else None, observe=history.note if history else None
+            task.path,
+            choose,
+            Policy(task.policy) if task.policy else None,
+            observe=history.note if history else None,
+            part=task.part,
         )
         if task.report is not None and history is not None:
             from companion import report
@@ -165,6 +189,8 @@ def text(found: Analysis) -> str:
         f"  verdict   {found.verdict.replace('_', ' ')}",
         f"  duration  {duration:.1f} s" if isinstance(duration, float) else "  duration  unknown",
     ]
+    if found.part != WHOLE:
+        lines.append(f"  part      {found.part}")
     if replay is None:
         lines.append("  airframe  none configured for this vehicle: general checks only")
     else:

@@ -450,3 +450,14 @@ def test_vehicle_time_is_told_between_rows_and_never_before_the_newest_stamp():
     assert grid.vehicle_time_us(EPOCH_US + 1000 * MS) == 61_000 * MS
     assert grid.vehicle_time_us(EPOCH_US + 1500 * MS) == 61_500 * MS
     assert grid.vehicle_time_us(EPOCH_US) == 61_000 * MS
+
+
+def test_the_stamp_at_which_a_row_falls_due_is_told_beforehand():
+    grid = aligner()
+    assert grid.due_us == math.inf
+    for turn, delay_ms in enumerate((40, 10, 70, 10)):
+        flown(grid, 60_000 + 2_500 * turn, 21, arrival_us=EPOCH_US + (2_500 * turn + delay_ms) * MS)
+        due_us = grid.due_us
+        assert grid.due(due_us - 1) == []
+        assert len(grid.due(due_us)) == 1
+        assert grid.due_us == due_us + PERIOD_US

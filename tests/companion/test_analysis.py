@@ -4,9 +4,10 @@ import sys
 
 import pytest
 
-from companion.analysis import analyze, by_type, facts
+from companion.analysis import Part, analyze, by_type, facts
 from companion.decision import Policy
 from companion.dialect import encode
+from companion.errors import UserError
 from companion.events import same_events
 from companion.tlog import LINK_MASK, OWN_LINK, Reader, record
 from companion.vehicle import Heartbeat
@@ -187,3 +188,57 @@ def test_a_vehicle_without_an_airframe_has_its_checks_and_no_events(flown):
     assert found.content["vehicles"][0]["airframe"] is None
     assert "replay" not in found.content
     assert len(found.content["checks"]) > 3
+
+
+def cut(path, tmp_path, begin_s, end_s):
+    """The log as it would be had it been recorded from begin_s to end_s alone."""
+    first_us = next(iter(Reader(path))).stamp_us & ~LINK_MASK
+    inside = range(first_us + round(begin_s * 1e6), first_us + round(end_s * 1e6))
+    return rewritten(path, tmp_path, lambda one: as_it_was(one) if one.stamp_us & ~LINK_MASK in inside else b"")
+
+
+def test_a_part_in_time_is_analysed_as_a_log_that_holds_no_more(flown, tmp_path):
+    flight, path = flown
+    end_s = flight.time("fault/detected") - 5.0
+    part = analyzed(path, part=Part(5.0, end_s)).content
+    alone = analyzed(cut(path, tmp_path, 5.0, end_s)).content
+    assert part.pop("part") == {"from_s": 5.0, "to_s": end_s, "systems": []}
+    alone.pop("replay", None)
+    assert part.pop("log")["path"] == str(path)
+    alone.pop("log")
+    assert part == alone
+    assert part["faults"] == []
+    assert part["duration_s"] == pytest.approx(end_s - 5.0, abs=0.15)  # whole steps of the simulator
+
+
+def test_a_part_by_systems_is_analysed_as_a_log_of_these_alone(flown, tmp_path):
+    _, path = flown
+    stranger = encode("HEARTBEAT", {"type": 2, "autopilot": 3}, sysid=9, compid=1, seq=0)
+    log = tmp_path / "two.tlog"
+    log.write_bytes(record(1_767_225_600_000_000, 0, stranger) + path.read_bytes())
+    assert [one["sysid"] for one in analyzed(log).content["vehicles"]] == [9, 1]
+    part = analyzed(log, part=Part(systems=frozenset({1}))).content
+    whole = analyzed(path).content
+    assert {name: part[name] for name in ("reader", "vehicles", "verdict", "faults", "checks", "events", "replay")} == {
+        name: whole[name] for name in ("reader", "vehicles", "verdict", "faults", "checks", "events", "replay")
+    }
+
+
+def test_a_part_that_holds_nothing_is_a_users_mistake_that_says_what_there_is(flown, tmp_path):
+    _, path = flown
+    with pytest.raises(UserError, match=r"it holds \d+\.\d s, systems 1"):
+        analyzed(path, part=Part(from_s=1e5))
+    with pytest.raises(UserError, match="systems 1"):
+        analyzed(path, part=Part(systems=frozenset({7})))
+    bare = rewritten(path, tmp_path, lambda one: one.frame.raw)
+    with pytest.raises(UserError, match="has a stamp"):
+        analyzed(bare, part=Part(to_s=5.0))
+
+
+def test_damage_is_counted_for_the_whole_file_whatever_part_is_looked_at(flown, tmp_path):
+    _, path = flown
+    log = tmp_path / "cut.tlog"
+    log.write_bytes(path.read_bytes()[:-3])
+    reader = analyzed(log, part=Part(0.0, 10.0)).content["reader"]
+    assert reader["tail_bytes"] > 0
+    assert sum(reader["messages"].values()) < 5000

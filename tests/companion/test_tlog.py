@@ -3,6 +3,7 @@
 import gzip
 import hashlib
 import json
+import mmap
 import random
 from collections import Counter
 from pathlib import Path
@@ -12,7 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from companion.dialect import encode
 from companion.errors import UserError
-from companion.tlog import LINK_MASK, OWN_LINK, Reader, record
+from companion.tlog import LINK_MASK, OWN_LINK, Reader, content, record
 
 LOGS = Path(__file__).parents[3] / "shared" / "data" / "tlogs"
 LARGEST_BYTES = 1_000_000
@@ -212,6 +213,29 @@ def test_a_compressed_log_is_read_as_the_log_itself(tmp_path):
     plain = read(written(tmp_path, data))
     packed = read(written(tmp_path, gzip.compress(data), "flight.tlog.gz"))
     assert packed == plain
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress], ids=["plain", "packed"])
+def test_a_large_log_is_mapped_not_held_and_read_as_a_small_one(pack, tmp_path, monkeypatch):
+    data = b"".join(records(300))
+    path = written(tmp_path, pack(data), "flight.tlog" if pack is bytes else "flight.tlog.gz")
+    whole = read(path)
+    assert isinstance(content(path), bytes)
+    monkeypatch.setattr("companion.tlog.WHOLE_BYTES", 1000)
+    monkeypatch.setattr("companion.tlog.UNPACKED_BYTES", 777)
+    with content(path) as mapped:
+        assert isinstance(mapped, mmap.mmap)
+        assert mapped[:] == data
+    assert read(path) == whole
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_report_does_not_depend_on_how_many_records_are_counted_at_a_time(tmp_path, monkeypatch):
+    strange = [record(stamp, 0, unknown(1)) for stamp in (START_US, 40)]
+    path = written(tmp_path, b"".join([*records(50), *strange, frame(7), *records(30)]))
+    at_once = read(path)
+    monkeypatch.setattr("companion.tlog.BATCH", 3)
+    assert read(path) == at_once
 
 
 def broken_inside():

@@ -116,6 +116,39 @@ def test_a_report_of_several_logs_and_no_jobs_at_all_are_refused(logs, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_part_of_a_log_is_judged_alone_and_named(logs, capsys):
+    words = ("--from", "5", "--to", "15", "--systems", "1,9", logs / "a_crossed.tlog")
+    code, out, _ = said(capsys, "analyze", *words)
+    assert code == 0  # the lines cross later
+    assert "part      5 s to 15 s, of systems 1, 9" in out
+    assert "duration  9." in out or "duration  10.0 s" in out
+    _, out, _ = said(capsys, "analyze", "--json", *words)
+    content = json.loads(out)
+    assert content["part"] == {"from_s": 5.0, "to_s": 15.0, "systems": [1, 9]}
+    assert content["faults"] == []
+    assert content["log"]["bytes"] == (logs / "a_crossed.tlog").stat().st_size
+    assert said(capsys, "analyze", "--from", "5", logs / "a_crossed.tlog")[0] == 1
+    assert "part" not in json.loads(said(capsys, "analyze", "--json", logs / "a_crossed.tlog")[1])
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--from", "-1"), "seconds from the log's start"),
+        (("--from", "20", "--to", "10"), "seconds from the log's start"),
+        (("--to", "nan"), "seconds from the log's start"),
+        (("--systems", "one"), "--systems one: give numbers"),
+        (("--report", "page.html", "--to", "10"), "--report shows a whole log"),
+        (("--from", "1000"), "it holds 45.0 s, systems 1"),
+    ],
+)
+def test_a_part_that_cannot_be_is_refused_in_one_line(words, text, logs, capsys):
+    code, out, error = said(capsys, "analyze", *words, logs / "a_crossed.tlog")
+    assert (code, out) == (2, "")
+    assert text in error
+    assert error.count("\n") == 1
+
+
 def test_events_of_all_logs_are_one_table_of_parquet(logs, tmp_path, capsys):
     path = tmp_path / "events.parquet"
     code, out, err = said(capsys, "analyze", "--json", logs / "a_crossed.tlog", logs / "b_healthy.tlog", "--events", path)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from companion.checks import CHECKS, Bench, Severity, Status, worst
-from companion.checks.finding import Held, Mean, Means, change
+from companion.checks.finding import EVERY_BEAT, EVERY_FRAME, Excess, Held, Joined, Mean, Means, change, runs
+from companion.checks.series import Series
 from companion.dialect import by_name
 
 START_US = 1_760_000_000_000_000
@@ -137,7 +138,8 @@ def test_a_hundred_thousand_messages_cost_about_a_second_of_cpu(log):
 def test_no_value_on_the_wire_raises_anything(log, kind, autopilot):
     """Random bytes as payload: infinities, NaN, indices and counts out of range."""
     rng = np.random.default_rng(kind)
-    names = sorted({name for check in CHECKS for group in (*check.needs, *check.also) for name in group.split("|")} - {"*"})
+    needed = {name for check in CHECKS for group in (*check.needs, *check.also) for name in group.split("|")}
+    names = sorted(needed - {EVERY_FRAME, EVERY_BEAT})
     flight = log(type=kind, autopilot=autopilot)
     flight.fly(10.0, 12.0, lambda _: [])
     bench = Bench()
@@ -176,6 +178,75 @@ class TestHeld:
         for t_s in (100.0, 103.0, 1.0, 2.0):
             held.take(t_s, True)
         assert held.spans() == ((100.0, 103.0),)
+
+
+class TestExcess:
+    def test_it_keeps_how_far_the_value_went_and_how_far_within_what_lasted(self):
+        excess = Excess(limit=10.0, hold_s=2.0)
+        for t_s, value in enumerate((1.0, 50.0, 1.0, 11.0, 12.0, 13.0, 1.0)):
+            excess.take(float(t_s), value)
+        assert excess.spans() == ((3.0, 6.0),)
+        assert (excess.farthest, excess.worst) == (50.0, 13.0)
+
+    def test_where_small_values_are_wrong_the_smallest_is_the_farthest(self):
+        excess = Excess(limit=3.5, hold_s=0.0, below=True)
+        for t_s, value in enumerate((4.0, 3.5, 3.2, 3.4)):
+            excess.take(float(t_s), value)
+        assert excess.spans() == ((2.0, 3.0),)
+        assert (excess.farthest, excess.worst) == (3.2, pytest.approx(3.2))
+
+    def test_a_value_that_is_not_known_ends_what_stood_and_is_no_sample(self):
+        excess = Excess(limit=1.0, hold_s=2.0)
+        for t_s, value in ((0.0, 2.0), (1.9, 2.0), (1.95, math.nan), (2.0, 2.0), (3.9, 2.0)):
+            excess.take(t_s, value)
+        assert excess.spans() == ()
+        assert excess.samples == 4
+
+    def test_its_three_outcomes_are_said_in_the_words_given(self):
+        check = next(check for check in CHECKS if check.id == "gps_hdop")
+        words = ("nothing", "{farthest:.0f}, {worst:.0f} for {lasted_s:.0f} s", "at most {farthest:.0f}")
+        excess = Excess(limit=3.0, hold_s=2.0)
+        assert excess.result(check, *words).status is Status.NOT_AVAILABLE
+        excess.take(0.0, 2.0)
+        assert (excess.result(check, *words).status, excess.result(check, *words).text) == (Status.OK, "at most 2")
+        for t_s in (1.0, 2.0, 4.0):
+            excess.take(t_s, 7.0)
+        result = excess.result(check, *words)
+        assert (result.status, result.text, result.t) == (Status.WARNING, f"{check.text}: 7, 7 for 3 s", 1.0)
+
+
+class TestJoined:
+    def test_what_begins_soon_after_the_end_of_the_one_before_continues_it(self):
+        joined = Joined(gap_s=2.0)
+        for span in ((0.0, 1.0), (2.9, 3.0), (5.0, 6.0), (5.5, 5.8)):
+            joined.add(*span)
+        assert joined.spans == [(0.0, 3.0), (5.0, 6.0)]
+
+
+def test_runs_are_those_that_are_long_enough_up_to_the_last_place():
+    beyond = [True, False, True, True, False, False, True, True, True]
+    assert list(runs(beyond, 2)) == [(2, 3), (6, 8)]
+    assert list(runs(beyond, 1)) == [(0, 0), (2, 3), (6, 8)]
+    assert list(runs([], 1)) == []
+
+
+class TestSeries:
+    def test_boots_are_kept_apart_and_rows_come_out_in_the_order_of_time(self):
+        series = Series()
+        for boot, row in ((0, (2.0, 20.0, 7.0)), (0, (1.0, 10.0, math.nan)), (0, (2.0, 99.0, 8.0)), (1, (1.0, 1.0, 1.0))):
+            series.take(boot, row)
+        assert series.table(0).tolist() == [[2.0, 20.0, 7.0]]
+        assert series.table(0, slice(0, 1)).tolist() == [[1.0, 10.0], [2.0, 20.0]]
+        assert series.table(5).shape == (0, 1)
+
+    def test_the_longest_boot_is_the_one_in_which_the_values_asked_for_are_known(self):
+        series = Series()
+        for k in range(5):
+            series.take(0, (float(k), 1.0, math.nan))
+        series.take(1, (0.0, math.nan, 1.0))
+        assert series.longest() == 0
+        assert series.longest(slice(1, 2)) == 1
+        assert Series().longest() is None
 
 
 class TestChange:

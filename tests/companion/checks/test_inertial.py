@@ -3,6 +3,7 @@
 import pytest
 
 from companion.checks import Status
+from companion.checks.reading import imu
 
 NOT_AVAILABLE, OK, WARNING, FAULT = Status.NOT_AVAILABLE, Status.OK, Status.WARNING, Status.FAULT
 ONSET_S = 130.0
@@ -90,3 +91,29 @@ def test_highres_imu_is_read_with_its_own_units_and_instances(log):
     found = flight.findings()["gyro_pair"]
     assert found.status is FAULT
     assert "by 0.050 rad/s about x" in found.text
+
+
+def counts(**more):
+    names = [axis + kind for kind in ("gyro", "acc", "mag") for axis in "xyz"]
+    return dict.fromkeys(names, 0) | {"id": 0} | more
+
+
+def test_an_inertial_message_is_read_in_si_by_the_sensor_that_it_names():
+    found = imu("SCALED_IMU2", counts(zacc=-1000, xgyro=100, ymag=300), ardupilot=False)
+    assert found.instance == 1
+    assert found.gyro_rad_s == pytest.approx((0.1, 0.0, 0.0))
+    assert found.acceleration_m_s2 == pytest.approx((0.0, 0.0, -9.80665))
+    assert found.field_mg == (0.0, 300.0, 0.0)
+    told = imu("HIGHRES_IMU", counts(id=2, zacc=-9.8, xmag=0.25), ardupilot=False)
+    assert (told.instance, told.acceleration_m_s2, told.field_mg) == (2, (0.0, 0.0, -9.8), (250.0, 0.0, 0.0))
+
+
+def test_a_message_without_an_accelerometer_holds_a_compass_alone_or_nothing():
+    found = imu("SCALED_IMU3", counts(xmag=200, xgyro=5), ardupilot=True)
+    assert (found.gyro_rad_s, found.acceleration_m_s2, found.field_mg) == (None, None, (200.0, 0.0, 0.0))
+    assert imu("SCALED_IMU3", counts(), ardupilot=True).field_mg is None
+
+
+def test_raw_counts_are_believed_of_ardupilot_alone():
+    assert imu("RAW_IMU", counts(zacc=-1000), ardupilot=False) is None
+    assert imu("RAW_IMU", counts(zacc=-1000), ardupilot=True).instance == 0

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fdi.kernel import Compiler
 from fdi.verdict import NO_FAULT, Fault, Phase, Signature, Verdict
 from fdi.windows import MovingAverage
 
@@ -69,7 +70,7 @@ class Monitor:
     the share of thrust lost, over the window of the residual; `onset_s` the time since detection plus the median delay.
     """
 
-    def __init__(self, config: Config, flights: int) -> None:
+    def __init__(self, config: Config, flights: int, compiler: Compiler | None = None) -> None:
         """Raises ValueError if flights is below 1."""
         if flights < 1:
             raise ValueError(f"flights = {flights}: a batch has at least one flight")

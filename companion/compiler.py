@@ -1,0 +1,24 @@
+"""The compiler of kernels (fdi/kernel.py): numba, where it is installed and the work is long enough for it."""
+
+from functools import cache
+
+from fdi.kernel import Compiler
+
+
+@cache
+def compiler() -> Compiler | None:
+    """What makes machine code of a kernel and keeps it for later starts; None where numba is not installed.
+
+    The code kept does not notice a change in a kernel of another file: after such an edit delete
+    fdi/**/__pycache__/*.nb[ci].
+    """
+    try:
+        from numba import njit
+    except ModuleNotFoundError as error:
+        if error.name != "numba":
+            raise
+        return None
+    # No test for a division by zero, which no kernel does; no counting of references to arrays, which no kernel makes or
+    # keeps, and which takes three quarters of the time.
+    made: Compiler = njit(cache=True, error_model="numpy", _nrt=False)
+    return made
