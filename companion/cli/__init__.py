@@ -19,6 +19,7 @@ COMMANDS: Final = {  # name -> what `mavfdi --help` says of it
     "analyze": "say what happened in telemetry logs",
     "info": "print what is in telemetry logs, without judging",
     "export": "write a log's messages as Parquet or CSV",
+    "montecarlo": "fly thousands of simulated flights, one row a flight",
     "config": "print an airframe's configuration and where each value comes from",
 }
 FAILED: Final = 2

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from fdi.ekf import WindHeadingFilter
 
 Row = tuple[float, float, float, float]
-DETECTORS = ("paper",)
+DETECTORS = ("paper", "gps", "gyro")
 
 
 def _check_above_zero(table: str, values: dict[str, float]) -> None:
@@ -196,6 +196,128 @@ class Paper:
 
 
 @dataclass(frozen=True, slots=True)
+class Response:
+    """The lateral model held over one period, without feedback: how a hypothesis expects the vehicle to turn."""
+
+    transition: tuple[Row, Row, Row, Row]
+    input: Row  # per metre
+
+    def __post_init__(self) -> None:
+        for row in self.transition:
+            _check_finite("response", "transition", row)
+        _check_finite("response", "input", self.input)
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """What a sound motor may do, and when an encoder accuses it."""
+
+    slowest_rate_factor: float  # of the nominal motor
+    slowest_lag_factor: float
+    fastest_rate_factor: float
+    fastest_lag_factor: float
+    tolerance_m: float  # of the encoder beyond the envelope
+    samples_outside: int  # in a row, that accuse
+    settle_s: float  # after an accusation, until its kind is looked for
+    moved_m: float  # that an encoder must move to have moved
+    commanded_m: float  # below the encoder, that ask a motor to move
+    commanded_s: float  # for so long
+    clear_s: float  # beyond the value of the fault, that take the accusation back
+    confidence: float  # share of the accusations in the design flights that were right
+
+    def __post_init__(self) -> None:
+        names = [name for name in self.__slots__ if name != "confidence"]
+        _check_above_zero("envelope", {name: getattr(self, name) for name in names})
+        _check_share("envelope", {"confidence": self.confidence})
+
+
+@dataclass(frozen=True, slots=True)
+class ThresholdDesign:
+    """Where a threshold of the turn monitor comes from."""
+
+    date: str
+    command: str
+    first_seed: int
+    healthy_flights: int
+    false_alarms_per_flight: float  # of 600 s, that the rule asks for
+
+    def __post_init__(self) -> None:
+        _check_share("turns.design", {"false_alarms_per_flight": self.false_alarms_per_flight})
+
+
+@dataclass(frozen=True, slots=True)
+class GpsBank:
+    """Filters on GPS velocity."""
+
+    wind_noise_m_s_sqrt_s: float
+    velocity_noise_m_s: float
+    bias_noise_rad_s_sqrt_s: float
+    coloured_time_s: float
+    coloured_rad_s: float
+    coloured_per_change: float
+    threshold: float  # of the clipped sum of log likelihood ratios
+    margin: float  # of the whole sum of the one named over all others
+    design: ThresholdDesign
+
+    def __post_init__(self) -> None:
+        _check_above_zero("turns.gps", {name: getattr(self, name) for name in self.__slots__ if name != "design"})
+
+
+@dataclass(frozen=True, slots=True)
+class GyroBank:
+    """Filters on the turn rate from gyro and attitude."""
+
+    rate_noise_rad_s: float
+    bias_noise_rad_s_sqrt_s: float
+    coloured_time_s: float
+    coloured_rad_s: float
+    coloured_per_change: float
+    threshold: float
+    margin: float
+    agreement: float  # lead that the GPS bank must confirm
+    design: ThresholdDesign
+
+    def __post_init__(self) -> None:
+        _check_above_zero("turns.gyro", {name: getattr(self, name) for name in self.__slots__ if name != "design"})
+
+
+@dataclass(frozen=True, slots=True)
+class TurnMonitor:
+    """The multiple-model CUSUM of the turns."""
+
+    slack_m: float  # of each line, if it is known
+    curvature_per_m: float  # turning effect of a line: d - curvature d^2
+    clip: float  # of a log likelihood ratio, in the sum that alarms
+    drift: float  # taken off that sum with each measurement
+    floor: float  # it never falls below
+    whole_clip: float  # of a ratio, in the sum that names
+    surest: float  # largest confidence: models are no better than that
+    hold_s: float  # from the alarm to the first naming
+    noted_s: float  # between two values of bias and effectiveness that are kept
+    bias_prior_rad_s: float
+    effectiveness_prior: float
+    bias_limit_rad_s: float
+    effectiveness_limit: float
+    bias_floor_rad_s: float
+    effectiveness_floor: float
+    level_s: float  # time constant by which the level of the noise follows the innovations
+    level_clip: float  # of a squared normalised innovation
+    level_limit: float  # of that level, a variance over the configured one
+    level_squared: float
+    calm: float
+    usual_factor: float
+    usual_s: float
+    gps: GpsBank
+    gyro: GyroBank
+
+    def __post_init__(self) -> None:
+        if self.slack_m < 0.0 or self.floor > 0.0:
+            raise ValueError(f"turns.slack_m = {self.slack_m} must be >= 0 and turns.floor = {self.floor} <= 0")
+        names = [name for name in self.__slots__ if name not in ("slack_m", "floor", "gps", "gyro")]
+        _check_above_zero("turns", {name: getattr(self, name) for name in names})
+
+
+@dataclass(frozen=True, slots=True)
 class Config:
     """The `[monitor]` table.  Every record raises ValueError, in one sentence, for a value that makes no sense."""
 
@@ -209,6 +331,9 @@ class Config:
     navigation: WindHeadingFilter
     lateral_model: LateralModel
     observer: Observer
+    response: Response
+    envelope: Envelope
+    turns: TurnMonitor
     paper: Paper
 
     def __post_init__(self) -> None:

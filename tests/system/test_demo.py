@@ -134,7 +134,7 @@ def test_on_a_terminal_the_view_shows_clock_residuals_alarms_and_recovery(tmp_pa
     assert code == 0, written
     screen = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", written)
     for words in (
-        f"mavfdi demo: parafoil, seed {SEED}", "armed", "heading_rate", "of 0.0443", "turn_rate_command_rad_s", "│", "█",
+        f"mavfdi demo: parafoil, seed {SEED}", "armed", "heading_rate", "of 15", "turn_rate_command_rad_s", "│", "█",
         "control lines crossed (99.9 %)", "recovery: changed and verified", "repair verified", "healthy",
     ):  # fmt: skip
         assert words in screen, words
