@@ -238,7 +238,7 @@ def test_the_first_use_of_the_compiled_reader_says_so_on_a_terminal(tmp_path):
     ours, theirs = pty.openpty()
     try:
         compiled_anew(tmp_path, theirs)
-        assert os.read(ours, 1000).decode().startswith("compiling the log reader, once")
+        assert os.read(ours, 1000).decode().startswith("compiling the log reader and the monitor, once")
     finally:
         os.close(theirs)
         os.close(ours)
