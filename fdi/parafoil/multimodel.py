@@ -60,7 +60,6 @@ from fdi.parafoil.turns import (
     SUMS,
     WARM_UP_GPS,
     WARM_UP_GYRO,
-    WHOLE,
     Bank,
     Level,
     TurnFigures,
@@ -69,7 +68,6 @@ from fdi.parafoil.turns import (
     decide_turns,
     hear_gps,
     hear_gyro,
-    largest_sum,
     leader,
     note,
     start_gps,
@@ -442,25 +440,20 @@ def conclude(state: State, f: int, figures: Figures, judged: bool, numbers: Floa
 
 @kernel
 def _turn_residuals(state: State, f: int, bank: int, judged: bool, residuals: FloatArray) -> None:
-    """How much worse than the best each hypothesis explains the turns: healthy by its clipped sum, faults by the whole."""
-    clocks = state.turns.clocks[f]
+    """What speaks for each fault: its clipped sum; of the one named the sum at the naming less what spoke against it since.
+
+    That of the healthy hypothesis, what speaks against it, is the largest of them.
+    """
+    clocks, sums = state.turns.clocks[f], state.turns.sums[f, bank]
     mode = int(clocks[MODE])
-    if not judged:
-        residuals[0] = math.nan
-        for i in range(1, HYPOTHESES):
-            residuals[2 + i] = math.nan
-        return
-    if mode == HEALTHY:
-        residuals[0] = max(largest_sum(state.turns.sums[f, bank], mode), 0.0)
-    else:  # what named the fault, less what speaks for a healthy vehicle since
-        residuals[0] = max(clocks[SUM_AT_NAMING] - max(state.turns.sums[f, bank, CLIPPED, HEALTHY], 0.0), 0.0)
-    whole = state.turns.sums[f, bank, WHOLE]
-    best = 0.0
-    for i in range(HYPOTHESES):
-        if i != mode:
-            best = max(best, whole[i])
+    residuals[0] = 0.0 if judged else math.nan
     for i in range(1, HYPOTHESES):
-        residuals[2 + i] = best - (0.0 if i == mode else whole[i])
+        speaks_for = max(sums[CLIPPED, i], 0.0)
+        if i == mode:
+            speaks_for = max(clocks[SUM_AT_NAMING] - max(sums[CLIPPED, HEALTHY], 0.0), 0.0)
+        residuals[2 + i] = speaks_for if judged else math.nan
+        if judged:
+            residuals[0] = max(residuals[0], speaks_for)
 
 
 @kernel
@@ -697,7 +690,7 @@ class MultipleModel:
         turns = config.turns
         bank = turns.gyro if config.detector == "gyro" else turns.gps
         tolerance_m = config.envelope.tolerance_m
-        self._thresholds = np.array([bank.threshold, tolerance_m, tolerance_m, bank.margin, bank.margin, bank.margin])
+        self._thresholds = np.array([bank.threshold, tolerance_m, tolerance_m, *(bank.threshold,) * 3])
 
     def _arrays(self) -> dict[str, FloatArray]:
         state = self._state

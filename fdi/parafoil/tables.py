@@ -56,10 +56,10 @@ FAULTS = (
 )
 
 RESIDUALS = (
-    "heading_rate",  # rad2/s2, of the healthy hypothesis
+    "heading_rate",  # paper: rad2/s2, of the healthy hypothesis; ours: the largest of the last three
     "motor_1",  # m, by output
     "motor_2",
-    "broken_left",  # rad2/s2, each of its own hypothesis
+    "broken_left",  # paper: rad2/s2, each of its own hypothesis; ours: its sum of log likelihood ratios
     "broken_right",
     "crossed",
 )
@@ -71,7 +71,8 @@ def _signature(fault_id: str, *marks: str) -> Signature:
     return Signature(fault_id, dict(zip(RESIDUALS, marks, strict=True)))
 
 
-# A fault's own observer follows the faulty vehicle, so that its residual stays quiet while the others trip.
+# Of the paper's residuals: a fault's own observer follows the faulty vehicle, so that its residual stays quiet while the
+# others trip.  Ours are the other way round: what speaks for a fault is above its threshold when it is named.
 SIGNATURES = (
     #          fault                heading_rate  motor_1  motor_2  broken_left  broken_right  crossed
     _signature("motor:left", "+", "+", "0", ".", ".", "."),
