@@ -88,7 +88,9 @@ def main(args: argparse.Namespace) -> int:
             path = store.join()
         except KeyboardInterrupt:
             progress.clear()
-            kept = progress.before + progress.flown
+            kept = wanted.flights - sum(
+                len(run) for run in store.missing
+            )  # asked of the disk: a signal may fall behind a part
             print(f"mavfdi montecarlo: stopped; {kept} of {wanted.flights} flights are kept in {args.out}", file=sys.stderr)
             print("mavfdi montecarlo: the same command goes on from there", file=sys.stderr)
             return STOPPED
