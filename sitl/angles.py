@@ -2,18 +2,18 @@
 
 import math
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 
 TURN_RAD = 2.0 * math.pi
 
 
-@kernel
+@plant_kernel
 def wrap_pi(angle_rad: float) -> float:
     """The same angle in (-pi, pi], rad."""
     return angle_rad - TURN_RAD * math.ceil((angle_rad - math.pi) / TURN_RAD)
 
 
-@kernel
+@plant_kernel
 def wrap_turn(angle_rad: float) -> float:
     """The same angle in [0, 2 pi), rad: compass headings on the wire."""
     wrapped = angle_rad - TURN_RAD * math.floor(angle_rad / TURN_RAD)

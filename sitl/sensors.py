@@ -2,10 +2,10 @@
 
 import math
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 
 
-@kernel
+@plant_kernel
 def gauss_markov_step(error: float, sigma: float, time_constant_s: float, dt_s: float, normal: float) -> float:
     """Next value of a first-order Gauss-Markov error, exact over dt_s.
 
@@ -16,13 +16,13 @@ def gauss_markov_step(error: float, sigma: float, time_constant_s: float, dt_s: 
     return decay * error + sigma * math.sqrt(1.0 - decay * decay) * normal
 
 
-@kernel
+@plant_kernel
 def quantised(value: float, resolution: float) -> float:
     """The reading of a counting sensor: the nearest multiple of its resolution (same unit; 0: not quantised)."""
     return value if resolution <= 0.0 else math.floor(value / resolution + 0.5) * resolution
 
 
-@kernel
+@plant_kernel
 def standard_pressure_pa(altitude_m: float) -> float:
     """Static pressure, Pa, at an altitude above sea level, m, below 11 km.  Source: ICAO standard atmosphere, Doc 7488."""
     return 101325.0 * math.pow(1.0 - 2.25577e-5 * altitude_m, 5.25588)

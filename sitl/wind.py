@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 
 FOOT_M = 0.3048
 LOW_ALTITUDE_M = 305.0  # below: the low-altitude law; above twice this: constant length and intensity
@@ -25,7 +25,7 @@ SPEED_10M, DIRECTION, VEER, SHEAR, SHEAR_LENGTH, SHEAR_PHASE, SIGMA = range(7)
 PROFILE = 7
 
 
-@kernel
+@plant_kernel
 def profile_wind(profile: NDArray[np.float64], height_m: float) -> tuple[float, float]:
     """Wind without its shear wave, (north, east), m/s, at a height above ground, m.
 
@@ -37,7 +37,7 @@ def profile_wind(profile: NDArray[np.float64], height_m: float) -> tuple[float, 
     return speed * math.cos(direction), speed * math.sin(direction)
 
 
-@kernel
+@plant_kernel
 def mean_wind(profile: NDArray[np.float64], height_m: float) -> tuple[float, float]:
     """Wind without turbulence, (north, east), m/s: `profile_wind` and a wave across it.
 
@@ -49,7 +49,7 @@ def mean_wind(profile: NDArray[np.float64], height_m: float) -> tuple[float, flo
     return north - across * math.sin(direction), east + across * math.cos(direction)
 
 
-@kernel
+@plant_kernel
 def turbulence(height_m: float, wind_20ft_m_s: float, sigma_high_m_s: float) -> tuple[float, float, float]:
     """Length scale, m, horizontal and vertical intensity, m/s, of Dryden turbulence at a height above ground, m.
 
@@ -69,14 +69,14 @@ def turbulence(height_m: float, wind_20ft_m_s: float, sigma_high_m_s: float) -> 
     return length, sigma, sigma
 
 
-@kernel
+@plant_kernel
 def transverse_gust(gust: NDArray[np.float64], axis: int, sigma_m_s: float) -> float:
     """Gust along one axis, m/s, from the two filters of that axis: sigma/sqrt2 (sqrt3 x1 - (sqrt3 - 1) x2)."""
     shape = SQRT3 * gust[FIRST_NORTH + axis] - (SQRT3 - 1.0) * gust[SECOND_NORTH + axis]
     return float(sigma_m_s / math.sqrt(2.0) * shape)
 
 
-@kernel
+@plant_kernel
 def transverse_step(
     gust: NDArray[np.float64], normal: NDArray[np.float64], length_m: float, airspeed_m_s: float, dt_s: float
 ) -> None:
@@ -94,14 +94,14 @@ def transverse_step(
         gust[FIRST_NORTH + axis] = decay * first + drive * normal[axis]
 
 
-@kernel
+@plant_kernel
 def roll_gust_sigma(sigma_vertical_m_s: float, length_m: float, span_m: float) -> float:
     """Standard deviation of the roll gust, rad/s.  Source: MIL-F-8785C, 3.7.1.3, spectrum of p_g, integrated."""
     shape = math.pow(math.pi * length_m / (4.0 * span_m), 1.0 / 3.0)
     return sigma_vertical_m_s * math.sqrt(0.8 * shape * math.pi * math.pi / (8.0 * span_m * length_m))
 
 
-@kernel
+@plant_kernel
 def roll_gust_step(
     gust: NDArray[np.float64], sigma_rad_s: float, span_m: float, airspeed_m_s: float, dt_s: float, normal: float
 ) -> float:
@@ -111,7 +111,7 @@ def roll_gust_step(
     return float(gust[ROLL_GUST])
 
 
-@kernel
+@plant_kernel
 def yaw_gust_step(
     gust: NDArray[np.float64],
     gust_north_m_s: float,

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 
 GRAVITY_M_S2 = 9.80665
 SEA_LEVEL_DENSITY_KG_M3 = 1.225
@@ -85,13 +85,13 @@ WIND_NORTH, WIND_EAST, WIND_DOWN, GUST_P, GUST_R = range(5)
 AIR = 5
 
 
-@kernel
+@plant_kernel
 def density_kg_m3(altitude_m: float) -> float:
     """Air density, kg/m3, at an altitude above sea level, m, below 11 km.  Source: ICAO standard atmosphere."""
     return SEA_LEVEL_DENSITY_KG_M3 * math.pow(1.0 - 2.25577e-5 * altitude_m, 4.2559)
 
 
-@kernel
+@plant_kernel
 def fill_body(body: NDArray[np.float64], payload_factor: float) -> None:
     """Write mass, arms and rigid inertia for a payload of payload_factor times the nominal one into body, (BODY,)."""
     payload = PAYLOAD_MASS_KG * payload_factor
@@ -120,7 +120,7 @@ def nominal_body() -> NDArray[np.float64]:
     return body
 
 
-@kernel
+@plant_kernel
 def hold(held: NDArray[np.float64], body: NDArray[np.float64], density: float) -> None:
     """Write density, kg/m3, the apparent masses and the inverse generalised mass at it into held, (HELD,).
 
@@ -158,13 +158,13 @@ def hold(held: NDArray[np.float64], body: NDArray[np.float64], density: float) -
     held[INVERSE_RR] = 1.0 / held[TOTAL_ZZ]
 
 
-@kernel
+@plant_kernel
 def line_effect_m(deflection_m: float) -> float:
     """How a deflection of the trailing edge, m, counts for turning: a line pulled far does less for each metre (c)."""
     return deflection_m - 0.18 * deflection_m * deflection_m
 
 
-@kernel
+@plant_kernel
 def derivative(
     state: NDArray[np.float64],
     line_left_m: float,
@@ -259,7 +259,7 @@ def derivative(
     rate[PSI] = turning / cos_theta
 
 
-@kernel
+@plant_kernel
 def velocity_ned_m_s(state: NDArray[np.float64]) -> tuple[float, float, float]:
     """Velocity over ground, NED, m/s, of a state, (STATES,)."""
     u, v, w = state[U], state[V], state[W]
@@ -272,7 +272,7 @@ def velocity_ned_m_s(state: NDArray[np.float64]) -> tuple[float, float, float]:
     return cos_psi * level - sin_psi * across, sin_psi * level + cos_psi * across, down
 
 
-@kernel
+@plant_kernel
 def ned_to_body(state: NDArray[np.float64], north: float, east: float, down: float) -> tuple[float, float, float]:
     """A vector given in NED, in the body axes of a state, (STATES,); any unit."""
     sin_phi, cos_phi = math.sin(state[PHI]), math.cos(state[PHI])
@@ -288,7 +288,7 @@ def ned_to_body(state: NDArray[np.float64], north: float, east: float, down: flo
     )
 
 
-@kernel
+@plant_kernel
 def runge_kutta(
     state: NDArray[np.float64],
     line_left_m: float,
@@ -317,7 +317,7 @@ def runge_kutta(
         state[i] += dt_s / 6.0 * (work[0, i] + 2.0 * (work[1, i] + work[2, i]) + work[3, i])
 
 
-@kernel
+@plant_kernel
 def motor_step(position_m: float, command_m: float, lag_s: float, rate_m_s: float, dt_s: float) -> float:
     """Next position of a line's motor, m: first-order lag with a rate limit (c)."""
     step = (command_m - position_m) * (1.0 - math.exp(-dt_s / lag_s))

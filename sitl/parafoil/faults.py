@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 from sitl.parafoil import config
 from sitl.parafoil.dynamics import TRAVEL_M, motor_step
 from sitl.vehicle import Injected, check_faults
@@ -26,13 +26,13 @@ _KINDS = {"stuck": STUCK, "saturation": SATURATION}
 _IDS = ("motor:left", "motor:right", "broken_line:left", "broken_line:right", "crossed_lines")
 
 
-@kernel
+@plant_kernel
 def fault_acts(fault: NDArray[np.float64], t_ms: int) -> bool:
     """Whether a fault, (4,), acts in a step that begins at t_ms."""
     return bool(fault[KIND] != NONE and fault[ONSET_MS] <= t_ms < fault[CLEAR_MS])
 
 
-@kernel
+@plant_kernel
 def faulty_motor_step(
     fault: NDArray[np.float64],
     t_ms: int,
@@ -53,7 +53,7 @@ def faulty_motor_step(
     return motor_step(position_m, command_m, lag_s, rate_m_s, dt_s)
 
 
-@kernel
+@plant_kernel
 def pulled_lines(
     faults: NDArray[np.float64], t_ms: int, motor_1_m: float, motor_2_m: float, slack_m: float
 ) -> tuple[float, float]:

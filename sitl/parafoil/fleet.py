@@ -105,7 +105,7 @@ class Fleet:
         self._slow = np.array([float(channel in SLOW_CHANNELS) for channel in CHANNELS])
         self._t_ms = 0
         self._dt_ms = 0  # not yet known
-        begin(self._flights, self._normals.values, self._normals.next_row(), self._home, self._sensors)
+        begin(self._flights, self._normals.values, self._normals.next_row(), self._home, self._sensors, self._work)
 
     @property
     def time_s(self) -> float:

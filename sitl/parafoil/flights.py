@@ -7,7 +7,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 from sitl.parafoil import dynamics, guidance, navigation
 from sitl.parafoil.config import Config, Range, Spread
 from sitl.parafoil.faults import FAULTS, no_faults
@@ -196,7 +196,7 @@ def draw(flights: Flights, f: int, config: Config, source: Generator) -> NDArray
     return chance
 
 
-@kernel
+@plant_kernel
 def _release(
     state: NDArray[np.float64],
     held: NDArray[np.float64],

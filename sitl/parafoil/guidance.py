@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.angles import wrap_pi
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 from sitl.parafoil.dynamics import DC_GAIN_RAD_S_M, SEA_LEVEL_DENSITY_KG_M3, TRAVEL_M, density_kg_m3
 from sitl.parafoil.navigation import AIRSPEED, ESTIMATED_EAST, ESTIMATED_NORTH, HEADING, HEADING_RATE
 from sitl.wind import profile_wind
@@ -60,19 +60,19 @@ PROBE_QUIET_MS, PROBE_PULSE_MS, PROBE_HEIGHT_M = 30000.0, 2500.0, 300.0
 STUCK_LOW_M, STUCK_HIGH_M = 0.10, 1.10  # beyond these a stuck side leaves turns to one side only
 
 
-@kernel
+@plant_kernel
 def clipped(value: float, low: float, high: float) -> float:
     """The value, or the end of [low, high] that it lies beyond."""
     return min(max(value, low), high)
 
 
-@kernel
+@plant_kernel
 def nominal_sink_m_s(altitude_m: float) -> float:
     """Sink that the forecast's drift supposes, m/s, at an altitude above sea level, m."""
     return 5.0 * math.sqrt(SEA_LEVEL_DENSITY_KG_M3 / density_kg_m3(altitude_m))
 
 
-@kernel
+@plant_kernel
 def fill_forecast(
     forecast: NDArray[np.float64],
     profile: NDArray[np.float64],
@@ -100,7 +100,7 @@ def fill_forecast(
             forecast[i, DRIFT_NORTH + k] = forecast[i - 1, DRIFT_NORTH + k] + mean * seconds
 
 
-@kernel
+@plant_kernel
 def forecast_at(forecast: NDArray[np.float64], column: int, height_m: float) -> float:
     """One column of the forecast at a height above ground, m; linear between rows, the end rows' beyond."""
     place = clipped(height_m / FORECAST_STEP_M, 0.0, FORECAST_ROWS - 1.0)
@@ -109,7 +109,7 @@ def forecast_at(forecast: NDArray[np.float64], column: int, height_m: float) -> 
     return float(low + (place - i) * (high - low))
 
 
-@kernel
+@plant_kernel
 def start_guidance(guidance: NDArray[np.float64]) -> None:
     """The guidance at release: toggles up, first leg to the right."""
     for i in range(GUIDANCE):
@@ -118,7 +118,7 @@ def start_guidance(guidance: NDArray[np.float64]) -> None:
     guidance[LEG_SIGN] = 1.0
 
 
-@kernel
+@plant_kernel
 def allowed_direction(orders: NDArray[np.float64]) -> float:
     """+1 right turns only, -1 left turns only, 0 both; by order, or because a stuck side leaves no other."""
     stuck, value = orders[STUCK_SIDE], orders[STUCK_VALUE_M]
@@ -133,7 +133,7 @@ def allowed_direction(orders: NDArray[np.float64]) -> float:
     return float(orders[TURN_DIRECTION])
 
 
-@kernel
+@plant_kernel
 def differential_range_m(orders: NDArray[np.float64], direction: float) -> tuple[float, float]:
     """Lowest and highest differential toggle (right minus left), m, that the vehicle can follow."""
     left, right, value = orders[LIMIT_LEFT_M], orders[LIMIT_RIGHT_M], orders[STUCK_VALUE_M]
@@ -144,7 +144,7 @@ def differential_range_m(orders: NDArray[np.float64], direction: float) -> tuple
     return (0.0 if direction > 0.0 else -left), (0.0 if direction < 0.0 else right)
 
 
-@kernel
+@plant_kernel
 def _one_sided_rate(
     guidance: NDArray[np.float64],
     limit: NDArray[np.float64],
@@ -175,7 +175,7 @@ def _one_sided_rate(
     return direction * clipped(rate, 0.0, limit[TURN_LIMIT_RAD_S])
 
 
-@kernel
+@plant_kernel
 def _s_turn_heading(
     guidance: NDArray[np.float64],
     orders: NDArray[np.float64],
@@ -222,7 +222,7 @@ def _s_turn_heading(
     return float(bearing + guidance[LEG_SIGN] * off)
 
 
-@kernel
+@plant_kernel
 def _pull(
     guidance: NDArray[np.float64],
     orders: NDArray[np.float64],
@@ -262,7 +262,7 @@ def _pull(
     guidance[QUIET_RIGHT_MS] = 0.0 if guidance[RIGHT_M] >= PROBE_ENOUGH_M else guidance[QUIET_RIGHT_MS] + PERIOD_MS
 
 
-@kernel
+@plant_kernel
 def _probe_m(guidance: NDArray[np.float64], orders: NDArray[np.float64], height_m: float) -> float:
     """Pull on both toggles, m, that shows whether a side long unused still works."""
     quiet = max(guidance[QUIET_LEFT_MS], guidance[QUIET_RIGHT_MS])
@@ -274,7 +274,7 @@ def _probe_m(guidance: NDArray[np.float64], orders: NDArray[np.float64], height_
     return PROBE_PULL_M
 
 
-@kernel
+@plant_kernel
 def guide(
     guidance: NDArray[np.float64],
     orders: NDArray[np.float64],
@@ -323,7 +323,7 @@ def guide(
     guidance[SPARE_HEIGHT_M] = height_m * (1.0 - glide_ratio)
 
 
-@kernel
+@plant_kernel
 def glide_blind(guidance: NDArray[np.float64], limit: NDArray[np.float64], height_m: float) -> None:
     """Without GPS for a while: toggles up, straight on, flare as ever."""
     both = limit[FLARE_M] if height_m < limit[FLARE_HEIGHT_M] else 0.0

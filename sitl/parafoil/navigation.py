@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.angles import wrap_pi
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 from sitl.parafoil.dynamics import density_kg_m3
 
 # states, (ESTIMATE,): wind (where the air moves to), m/s; horizontal airspeed, m/s; heading of the air velocity, rad; its
@@ -31,13 +31,13 @@ VELOCITY_NOISE_M_S = 0.30
 START_VARIANCES = (4.0, 4.0, 2.0, 0.05, 0.01)
 
 
-@kernel
+@plant_kernel
 def polar_airspeed_m_s(altitude_m: float) -> float:
     """Horizontal airspeed of the nominal glide, m/s, at an altitude above sea level, m."""
     return POLAR_AIRSPEED_M_S * math.sqrt(POLAR_DENSITY_KG_M3 / density_kg_m3(altitude_m))
 
 
-@kernel
+@plant_kernel
 def start_estimate(
     estimate: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -59,7 +59,7 @@ def start_estimate(
         covariance[i, i] = START_VARIANCES[i]
 
 
-@kernel
+@plant_kernel
 def predict_estimate(
     estimate: NDArray[np.float64], covariance: NDArray[np.float64], polar_airspeed: float, dt_s: float
 ) -> None:
@@ -83,7 +83,7 @@ def predict_estimate(
     covariance[HEADING_RATE, HEADING_RATE] += walk * dt_s
 
 
-@kernel
+@plant_kernel
 def _update_component(
     estimate: NDArray[np.float64],
     covariance: NDArray[np.float64],
@@ -105,7 +105,7 @@ def _update_component(
             covariance[i, j] -= gain[i] * gain[j] / variance
 
 
-@kernel
+@plant_kernel
 def update_estimate(
     estimate: NDArray[np.float64],
     covariance: NDArray[np.float64],

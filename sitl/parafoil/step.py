@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sitl import wind
 from sitl.angles import wrap_pi, wrap_turn
-from sitl.kernel import kernel
+from sitl.kernel import plant_kernel
 from sitl.parafoil import dynamics, guidance, navigation
 from sitl.parafoil.faults import MOTOR_1, faulty_motor_step, pulled_lines
 from sitl.parafoil.flights import (
@@ -112,7 +112,7 @@ GPS_CHANNELS = np.array(
 )
 
 
-@kernel
+@plant_kernel
 def _move_air(flights: Flights, f: int, normal: NDArray[np.float64], dt_s: float) -> None:
     """Turbulence of this step, and the wind where the vehicle is; held over the step."""
     state, gust, profile, air = flights.state[f], flights.gust[f], flights.profile[f], flights.air[f]
@@ -133,7 +133,7 @@ def _move_air(flights: Flights, f: int, normal: NDArray[np.float64], dt_s: float
     )
 
 
-@kernel
+@plant_kernel
 def _move_motors(flights: Flights, f: int, t_ms: int, dt_s: float) -> None:
     """Motors follow the commands of the sample before; the plant sees the mean of their old and new positions."""
     circumstances, body, faults, motor = flights.circumstances[f], flights.body[f], flights.faults[f], flights.motor_m[f]
@@ -162,7 +162,7 @@ def _move_motors(flights: Flights, f: int, t_ms: int, dt_s: float) -> None:
     flights.line_m[f, 1] = right
 
 
-@kernel
+@plant_kernel
 def _touch_down(flights: Flights, f: int, t_ms: int) -> None:
     """End the flight: it stays where it is, level."""
     state = flights.state[f]
@@ -172,7 +172,7 @@ def _touch_down(flights: Flights, f: int, t_ms: int) -> None:
     flights.landed_ms[f] = t_ms
 
 
-@kernel
+@plant_kernel
 def _read_step_sensors(
     flights: Flights,
     f: int,
@@ -209,7 +209,7 @@ def _read_step_sensors(
     readings[C_LANDED] = 1.0 if flights.landed_ms[f] >= 0 else 0.0
 
 
-@kernel
+@plant_kernel
 def _read_fix_sensors(
     flights: Flights, f: int, home: NDArray[np.float64], sensors: NDArray[np.float64], normal: NDArray[np.float64]
 ) -> None:
@@ -249,7 +249,7 @@ def _read_fix_sensors(
     readings[C_CLIMB_RATE] = -down
 
 
-@kernel
+@plant_kernel
 def _navigate(flights: Flights, f: int, t_ms: int, home: NDArray[np.float64], work: NDArray[np.float64]) -> None:
     """Navigation filter and guidance, at a fix; without one, toggles stay for LOST_MS and go up then."""
     fix, estimate, covariance = flights.fix[f], flights.estimate[f], flights.covariance[f]
@@ -287,7 +287,7 @@ def _navigate(flights: Flights, f: int, t_ms: int, home: NDArray[np.float64], wo
     )
 
 
-@kernel
+@plant_kernel
 def _show_navigation(flights: Flights, f: int, home: NDArray[np.float64]) -> None:
     """What the autopilot tells of its navigation: the forecast until its filter runs, its estimate from then on."""
     fix, readings, estimate = flights.fix[f], flights.readings[f], flights.estimate[f]
@@ -308,12 +308,16 @@ def _show_navigation(flights: Flights, f: int, home: NDArray[np.float64]) -> Non
     readings[C_ALTITUDE_ERROR] = flights.guidance[f, guidance.SPARE_HEIGHT_M]
 
 
-@kernel
+@plant_kernel
 def begin(
-    flights: Flights, normals: NDArray[np.float64], row: int, home: NDArray[np.float64], sensors: NDArray[np.float64]
+    flights: Flights,
+    normals: NDArray[np.float64],
+    row: int,
+    home: NDArray[np.float64],
+    sensors: NDArray[np.float64],
+    work: NDArray[np.float64],
 ) -> None:
-    """Readings at release, before the first step, of all flights; normals: (flight, row, NORMALS)."""
-    work = np.zeros(WORK)
+    """Readings at release, before the first step, of all flights; normals: (flight, row, NORMALS); work as in `step`."""
     for f in range(flights.state.shape[0]):
         normal = normals[f, row]
         state, air = flights.state[f], flights.air[f]
@@ -324,7 +328,7 @@ def begin(
         _show_navigation(flights, f, home)
 
 
-@kernel
+@plant_kernel
 def step(
     flights: Flights,
     normals: NDArray[np.float64],
