@@ -223,7 +223,7 @@ class Envelope:
     commanded_m: float  # below the encoder, that ask a motor to move
     commanded_s: float  # for so long
     clear_s: float  # beyond the value of the fault, that take the accusation back
-    confidence: float  # share of the accusations in the design flights that were right
+    confidence: float  # that an accusation is right
 
     def __post_init__(self) -> None:
         names = [name for name in self.__slots__ if name != "confidence"]

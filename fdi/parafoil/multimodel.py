@@ -647,7 +647,7 @@ class MultipleModel:
     """Our monitor over a batch of flights; one row of the grid a step.
 
     `Verdict.confidence` of a line fault is its posterior probability among the hypotheses, each as likely before, as
-    far as the models are right; of a motor the share of such namings that were right in the design flights; 0 while
+    far as the models are right; of a motor a number of the configuration; 0 while
     none is named.  `size` is where a motor is stuck, or its limit, m.  `onset_s` of a line fault counts from the last
     moment at which nothing spoke for it, of a motor from the first reading that it could not have.
     """
