@@ -30,13 +30,15 @@ JUDGED = 2  # the row that is judged, in these
     SINCE_ROWS,  # since the first of the rows that accused it
     KIND,
     VALUE_M,  # where it is stuck, or its limit
+    HIGHEST_M,  # encoder since it was accused, or since it last fell though it was asked to rise
     BASE_M,  # the encoder when kinds began to be told apart
+    TOP_M,  # the highest at which it may have been kept
     BELOW_ROWS,  # in a row that the command stood well below
     FOLLOWED_ROWS,  # that speak against the accusation
     OUTSIDE_M,  # by which the encoder stands outside; below zero inside
     OUTSIDE_AGO,  # rows since that was known
-) = range(13)
-MOTOR = 13
+) = range(15)
+MOTOR = 15
 KIND_UNKNOWN, KIND_STUCK, KIND_SATURATION = 0.0, 1.0, 2.0
 
 
@@ -57,12 +59,12 @@ class MotorFigures(NamedTuple):
 
 
 @kernel
-def start_motor(motor: FloatArray, kept: FloatArray, position_m: float) -> None:
-    """Begin with the spool at a position; motor: (MOTOR,), kept: (2, ROWS_KEPT), commands and encoder."""
+def start_motor(motor: FloatArray, kept: FloatArray, low_m: float, high_m: float) -> None:
+    """Begin with the spool somewhere in an interval; motor: (MOTOR,), kept: (2, ROWS_KEPT), commands and encoder."""
     for i in range(MOTOR):
         motor[i] = 0.0
-    motor[LOW_M] = position_m
-    motor[HIGH_M] = position_m
+    motor[LOW_M] = low_m
+    motor[HIGH_M] = high_m
     motor[OUTSIDE_AGO] = math.inf
     for i in range(ROWS_KEPT):
         kept[0, i] = math.nan
@@ -71,7 +73,7 @@ def start_motor(motor: FloatArray, kept: FloatArray, position_m: float) -> None:
 
 @kernel
 def keep(kept: FloatArray, value: float, age_rows: float) -> None:
-    """A new row of one of both kinds; kept: (ROWS_KEPT,).  A late value goes where it belongs; NaN is none."""
+    """A new row of one of both kinds; kept: (ROWS_KEPT,).  A late value goes where it belongs; NaN is none; age >= 0."""
     for i in range(ROWS_KEPT - 1, 0, -1):
         kept[i] = kept[i - 1]
     kept[0] = math.nan
@@ -118,7 +120,7 @@ def step_motor(motor: FloatArray, kept: FloatArray, figures: MotorFigures) -> No
             motor[LOW_M] = encoder_m
             motor[HIGH_M] = encoder_m
     if motor[STANDING] > 0.0:
-        _tell_kind(motor, encoder_m, kept[0, JUDGED], figures)
+        _tell_kind(motor, encoder_m, kept[1, JUDGED + 1], kept[0, JUDGED], figures)
         if motor[FOLLOWED_ROWS] >= figures.clear_rows:
             motor[STANDING] = 0.0
     elif motor[OUTSIDE_ROWS] >= figures.rows_outside:
@@ -126,26 +128,41 @@ def step_motor(motor: FloatArray, kept: FloatArray, figures: MotorFigures) -> No
         motor[SINCE_ROWS] = motor[OUTSIDE_ROWS] - 1.0 + JUDGED
         motor[KIND] = KIND_UNKNOWN
         motor[VALUE_M] = encoder_m
+        motor[HIGHEST_M] = encoder_m
+        motor[TOP_M] = encoder_m
         motor[BELOW_ROWS] = 0.0
         motor[FOLLOWED_ROWS] = 0.0
 
 
 @kernel
-def _tell_kind(motor: FloatArray, encoder_m: float, command_m: float, figures: MotorFigures) -> None:
-    """Stuck or limited, once it is asked to come down: only a limited motor does.  Beyond its value it is mended."""
+def _tell_kind(motor: FloatArray, encoder_m: float, before_m: float, command_m: float, figures: MotorFigures) -> None:
+    """Stuck or limited, once it is asked to come down: only a limited motor does.  Beyond its value it is mended.
+
+    A limit is the highest that the motor has been: it may be on its way down from there before it is known what it has.
+    While it falls though more is asked of it, it still comes from above its limit.
+    """
+    held = command_m > encoder_m + figures.commanded_m
+    motor[HIGHEST_M] = encoder_m if held and encoder_m < before_m else max(motor[HIGHEST_M], encoder_m)
+    if held and abs(encoder_m - before_m) < 0.5 * figures.moved_m:
+        motor[TOP_M] = max(motor[TOP_M], encoder_m)
+    settled = motor[SINCE_ROWS] > figures.settle_rows
     if motor[KIND] == KIND_UNKNOWN:
-        motor[VALUE_M] = max(motor[VALUE_M], encoder_m) if motor[SINCE_ROWS] > figures.settle_rows else encoder_m
-    if motor[SINCE_ROWS] <= figures.settle_rows:
+        motor[VALUE_M] = max(motor[VALUE_M], encoder_m) if settled else encoder_m
+    if not settled:
         motor[BASE_M] = encoder_m
+        motor[TOP_M] = motor[HIGHEST_M]
         return
     inside = motor[OUTSIDE_ROWS] == 0.0
     if motor[KIND] != KIND_SATURATION and inside and encoder_m < motor[BASE_M] - figures.moved_m:
         motor[KIND] = KIND_SATURATION
+        motor[VALUE_M] = motor[HIGHEST_M]
     if motor[KIND] == KIND_UNKNOWN:
         below = not math.isnan(command_m) and command_m < encoder_m - figures.commanded_m
         motor[BELOW_ROWS] = motor[BELOW_ROWS] + 1.0 if below else 0.0
         if motor[BELOW_ROWS] >= figures.commanded_rows:
             motor[KIND] = KIND_STUCK
             motor[VALUE_M] = encoder_m
-    if inside and encoder_m > motor[VALUE_M] + figures.moved_m and motor[KIND] != KIND_UNKNOWN:
+    # Accused, it stands where it is stuck or at its limit, or comes down to there: whatever it has, it is no higher.
+    known_m = motor[VALUE_M] if motor[KIND] == KIND_STUCK else motor[TOP_M]
+    if inside and encoder_m > known_m + figures.moved_m:
         motor[FOLLOWED_ROWS] += 1.0

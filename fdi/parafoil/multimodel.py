@@ -83,6 +83,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 STAMP_TOLERANCE_S = 5e-7  # half the resolution of a stamp
+OLDEST_S = 1e6  # no sample is held for longer; its rows can be counted
 WARMING_PHASE, HEALTHY_PHASE = float(Phase.WARMING), float(Phase.HEALTHY)  # kernels know numbers only
 DETECTED_PHASE, ISOLATED_PHASE = float(Phase.DETECTED), float(Phase.ISOLATED)
 
@@ -155,8 +156,8 @@ def density_kg_m3(altitude_m: float) -> float:
 
 @kernel
 def is_known(values: FloatArray, age_s: FloatArray, channel: int, limits: FloatArray) -> bool:
-    """A value within its limits, (channel, 2), however old; NaN is none."""
-    return bool(limits[channel, 0] <= values[channel] <= limits[channel, 1]) and bool(age_s[channel] < math.inf)
+    """A value within its limits, (channel, 2), however old, and not from the future; NaN is none."""
+    return bool(limits[channel, 0] <= values[channel] <= limits[channel, 1]) and bool(0.0 <= age_s[channel] <= OLDEST_S)
 
 
 @kernel
@@ -196,7 +197,7 @@ def reset(state: State, f: int, figures: Figures) -> None:
     marks[LINES_AGO_S] = math.inf
     marks[SCALE] = 1.0
     for output in range(2):
-        start_motor(state.motors[f, output], state.kept[f, output], 0.0)
+        start_motor(state.motors[f, output], state.kept[f, output], 0.0, 0.0)
     start_turns(state.turns, f, figures.turns)
 
 
@@ -212,12 +213,11 @@ def arm(state: State, f: int, values: FloatArray, age_s: FloatArray, figures: Fi
     elif heard and marks[RUNNING] == 0.0:
         marks[RUNNING] = 1.0
         for output in range(2):
-            begun_m = 0.0
-            if is_known(values, age_s, ENCODER_1 + output, limits):
-                begun_m = values[ENCODER_1 + output]
-            elif is_known(values, age_s, OUTPUT_1 + output, limits):
-                begun_m = pull_m(values[OUTPUT_1 + output], *figures.pulses)
-            start_motor(state.motors[f, output], state.kept[f, output], begun_m)
+            low_m, high_m = 0.0, figures.motor.travel_m  # in flight a spool may be anywhere, also far from its command
+            if is_fresh(values, age_s, ENCODER_1 + output, limits, figures.period_s):
+                low_m = values[ENCODER_1 + output]
+                high_m = low_m
+            start_motor(state.motors[f, output], state.kept[f, output], low_m, high_m)
     # After release the vehicle reports its own estimate, no longer the forecast: the first value is kept.
     wind = is_known(values, age_s, WIND_SPEED, limits) and is_known(values, age_s, WIND_DIRECTION, limits)
     if wind and math.isinf(marks[FIX_AGO_S]) and (marks[RUNNING] == 0.0 or math.isnan(marks[FORECAST_NORTH])):
@@ -458,15 +458,17 @@ def _turn_residuals(state: State, f: int, bank: int, judged: bool, residuals: Fl
 
 @kernel
 def wait(state: State, f: int, figures: Figures) -> None:
-    """A row in which nothing enters: not armed, or not known whether."""
+    """A row in which nothing enters: not armed, or not known whether; in flight the spools move on all the same."""
     marks = state.marks[f]
     marks[FIX_AGO_S] += figures.period_s
     marks[TURN_AGO_S] += figures.period_s
     marks[LINES_AGO_S] += figures.period_s
-    for output in range(2):
-        state.motors[f, output, OUTSIDE_AGO] += 1.0
-        for kind in range(2):
-            keep(state.kept[f, output, kind], math.nan, 0.0)
+    if marks[RUNNING] > 0.0:
+        state.turns.clocks[f, MODE_ROWS] += 1.0
+        for output in range(2):
+            for kind in range(2):
+                keep(state.kept[f, output, kind], math.nan, 0.0)
+            step_motor(state.motors[f, output], state.kept[f, output], figures.motor)
 
 
 @kernel
@@ -488,11 +490,12 @@ def step_flight(
         move_lines(state, f, values, age_s, figures)
         hear_fix(state, f, values, age_s, figures, cross, densities)
         hear_attitude(state, f, values, age_s, figures, cross, densities)
+        clocks = state.turns.clocks[f]
+        clocks[MODE_ROWS] += 1.0
         judged = can_judge(state, f, figures)
         if judged:
             decide_turns(state.turns, f, figures.turns, judging_bank(state.marks[f], figures.use_gyro, figures.gap_s))
             note(state.turns, f, figures.turns)
-        clocks = state.turns.clocks[f]
         clocks[WARM_UP_GPS] = max(clocks[WARM_UP_GPS] - 1.0, 0.0)
         clocks[WARM_UP_GYRO] = max(clocks[WARM_UP_GYRO] - 1.0, 0.0)
     else:

@@ -508,7 +508,6 @@ def _agrees(turns: Turns, f: int, named: int, agreement: float) -> bool:
 def decide_turns(turns: Turns, f: int, figures: TurnFigures, bank: int) -> None:
     """Alarm, and another mode believed where the judging bank names one."""
     clocks = turns.clocks[f]
-    clocks[MODE_ROWS] += 1.0
     for each in range(BANKS):
         for i in range(HYPOTHESES):
             turns.sums[f, each, ROWS_ABOVE, i] += 1.0

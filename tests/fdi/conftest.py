@@ -1,17 +1,27 @@
-"""The configuration as packaged, and a small vehicle that obeys the monitor's own linear model."""
+"""The configuration as packaged, a small vehicle that obeys the monitor's own linear model, and the simulated one."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import settings
 from scipy.linalg import expm
 
 import fdi.parafoil as parafoil
+from companion import airframe as airframes
+from companion.campaign import flight
+from companion.compiler import compiler
+from fdi.verdict import NO_FAULT, Phase
+from sitl.ensemble import Ensemble
 
 PERIOD_S = 0.1
+
+# Property tests draw the same examples in every run, on a machine of any speed.
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
 
 
 @pytest.fixture(scope="session")
@@ -124,3 +134,82 @@ def fly(config):
 @pytest.fixture(scope="session")
 def scenario():
     return Scenario
+
+
+@pytest.fixture(params=["gyro", "gps"])
+def our_config(request, config):
+    """The packaged configuration with each of our detectors in turn."""
+    return replace(config, detector=request.param)
+
+
+@pytest.fixture(scope="session")
+def machine():
+    """A compiler that makes each kernel once, however many monitors are built with it."""
+    make, made = compiler(), {}
+
+    def once(function):
+        name = function.__module__, function.__qualname__
+        if name not in made:
+            made[name] = make(function)
+        return made[name]
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def simulate():
+    """simulate(faults, seconds, first_seed, orders, link) -> (values, age_s), each (row, flight, channel).
+
+    Flights of the simulated parafoil, one for each fault (`Injected`, or None), with consecutive seeds; the first row is
+    that of release.  orders: (seconds, flight, command, value); link: through a line that rounds, loses and delays.
+    """
+    parafoil_airframe = airframes.load("parafoil")
+    simulator = parafoil_airframe.load_simulator()
+
+    def simulate_all(faults, seconds, first_seed, orders=(), link=False):
+        seeds = range(first_seed, first_seed + len(faults))
+        fleet = simulator.Fleet(parafoil_airframe.simulator_config(simulator), seeds, faults)
+        listener = flight.listener(parafoil_airframe, simulator.VEHICLE) if link else None
+        flown = Ensemble(simulator.VEHICLE, fleet, seeds, flight.grid(parafoil_airframe), listener)
+        rows = []
+        for row in flown.rows(seconds):
+            for _, f, command, value in (order for order in orders if round(order[0] * 1e6) == row.t_us):
+                fleet.command(f, command, value)
+            if row.t_us >= 0:
+                rows.append((row.values.copy(), row.age_s.copy()))
+        return np.array([values for values, _ in rows]), np.array([age_s for _, age_s in rows])
+
+    return simulate_all
+
+
+class Judgement:
+    """All verdicts of a monitor over the rows, by name: (row, flight) or (row, flight, ...)."""
+
+    def __init__(self, verdicts):
+        for name in ("phase", "fault", "confidence", "size", "onset_s", "residuals", "signals"):
+            setattr(self, name, np.array([getattr(verdict, name) for verdict in verdicts]))
+
+    def ids(self, flight=0):
+        """What is named in each row, None where nothing is."""
+        return [None if fault == NO_FAULT else parafoil.FAULTS[fault].id for fault in self.fault[:, flight]]
+
+    def named_s(self, fault_id, flight=0):
+        """When it is named first, s; infinity if it never is."""
+        ids = self.ids(flight)
+        return ids.index(fault_id) * PERIOD_S if fault_id in ids else np.inf
+
+    def phases(self, flight=0):
+        return [Phase(phase) for phase in self.phase[:, flight]]
+
+
+@pytest.fixture(scope="session")
+def judge(machine):
+    """judge(config or monitor, values, age_s) -> (Judgement, monitor); compiled, where it is built here."""
+
+    def judge_all(monitor, values, age_s):
+        if isinstance(monitor, parafoil.Config):
+            monitor = parafoil.Monitor(monitor, values.shape[1], machine)
+        rows = zip(np.ascontiguousarray(values), np.ascontiguousarray(age_s), strict=True)
+        return Judgement([monitor.step(row, age) for row, age in rows]), monitor
+
+    return judge_all
